@@ -1,0 +1,1 @@
+//! Episodes, poses, specs and seeded random streams of Auto-E2H

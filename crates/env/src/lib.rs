@@ -1,0 +1,1 @@
+//! MuJoCo task pairs, cameras, control and scripted demonstrators of Auto-E2H

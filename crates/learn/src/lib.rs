@@ -1,0 +1,1 @@
+//! The closed loop of Auto-E2H: collection, iteration, evaluation, run directory and report

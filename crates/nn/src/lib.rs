@@ -1,0 +1,1 @@
+//! Candle layers that train on the CPU, their kernels, optimisers and weight files

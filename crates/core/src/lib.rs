@@ -1,1 +1,79 @@
-//! Episodes, poses, specs and seeded random streams of Auto-E2H
+//! What every other crate of Auto-E2H speaks in: episodes, observations, poses, directions, seeded random streams.
+//!
+//! Deliberately knows neither Candle nor MuJoCo: a program that only reads episodes needs neither.
+//!
+//! ```
+//! use e2h_core::{Direction, Episode, Observation, Origin, Outcome};
+//!
+//! let origin = Origin::demonstration("nut_assembly", Direction::Easy, 0, 42);
+//! let mut episode = Episode::new(origin, &[]);
+//! episode.push(&Observation { state: [0.0; 15], frames: vec![] }, &[0.0; 8])?;
+//! episode.outcome = Outcome::Success { at: 0 };
+//! assert_eq!(episode.len(), 1);
+//! # Ok::<(), e2h_core::Error>(())
+//! ```
+
+mod episode;
+mod pose;
+mod random;
+mod traits;
+
+pub use episode::{Action, Direction, Episode, Frames, Image, Kind, Observation, Origin, Outcome, State};
+pub use pose::{Pose, align_hemisphere};
+pub use random::{Rng, stream};
+pub use traits::{ActionChunk, Policy, Value};
+
+/// Entries of a state row: eef position 3, eef quaternion 4, object position 3, object quaternion 4, gripper opening 1.
+pub const STATE_DIM: usize = 15;
+/// Entries of an action row: goal position 3, goal quaternion 4, gripper 1.
+pub const ACTION_DIM: usize = 8;
+/// Control steps a second, Hz; one row of an [`Episode`] is one control step.
+pub const CONTROL_HZ: f64 = 20.0;
+
+/// What can be wrong with an episode or a request made of it.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The observation's cameras are not those of the episode.
+    #[error("episode expects {expected} camera image(s) an observation, got {found}")]
+    Cameras {
+        /// Cameras of the episode.
+        expected: usize,
+        /// Images in the observation.
+        found: usize,
+    },
+    /// An image differs in size from those before it.
+    #[error("camera `{camera}`: expected {expected:?} (height, width), got {found:?}")]
+    ImageSize {
+        /// Name of the camera.
+        camera: String,
+        /// Height and width so far.
+        expected: (usize, usize),
+        /// Height and width of the offending image.
+        found: (usize, usize),
+    },
+    /// Columns of an episode differ in length.
+    #[error("episode column `{column}`: expected {expected} rows, got {found}")]
+    Rows {
+        /// Name of the column.
+        column: String,
+        /// Rows of the state column.
+        expected: usize,
+        /// Rows found.
+        found: usize,
+    },
+    /// A number that should be finite is not.
+    #[error("episode column `{column}`, row {row}: a number is not finite")]
+    NotFinite {
+        /// Name of the column.
+        column: &'static str,
+        /// Row index.
+        row: usize,
+    },
+    /// A policy or value function failed; the message is the underlying library's.
+    #[error("{0}")]
+    Model(String),
+}
+
+/// Shorthand for a result with this crate's [`enum@Error`].
+pub type Result<T> = std::result::Result<T, Error>;

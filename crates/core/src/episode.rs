@@ -1,0 +1,352 @@
+use crate::{ACTION_DIM, Error, Pose, Result, STATE_DIM};
+use serde::{Deserialize, Serialize};
+
+/// One state row. Units: metres, unit quaternions (wxyz), metres of gripper opening.
+pub type State = [f32; STATE_DIM];
+/// One action row: absolute goal pose of the tool centre point in the robot base frame, and the gripper command
+/// (1 open, 0 closed).
+pub type Action = [f32; ACTION_DIM];
+
+/// Which task of a pair: the hard one that is learned, or the easy one that undoes it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Direction {
+    /// The task to learn (put the nut on).
+    Hard,
+    /// The task that undoes it (take the nut off).
+    Easy,
+}
+
+impl Direction {
+    /// The other task of the pair.
+    #[must_use]
+    pub fn reverse(self) -> Self {
+        match self {
+            Self::Hard => Self::Easy,
+            Self::Easy => Self::Hard,
+        }
+    }
+
+    /// `hard` or `easy`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hard => "hard",
+            Self::Easy => "easy",
+        }
+    }
+}
+
+impl std::fmt::Display for Direction {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// How an episode ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The success predicate held long enough; `at` is the row at which it first held of the run that ended the episode.
+    Success {
+        /// Row index.
+        at: usize,
+    },
+    /// The horizon was reached.
+    Timeout,
+    /// The object was dropped in a task that must hold it throughout.
+    Dropped,
+    /// The simulation diverged.
+    Diverged,
+}
+
+impl Outcome {
+    /// True for [`Outcome::Success`].
+    #[must_use]
+    pub fn is_success(self) -> bool {
+        matches!(self, Self::Success { .. })
+    }
+}
+
+/// What an episode is made from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Kind {
+    /// A scripted demonstrator.
+    Demonstration,
+    /// A policy.
+    Rollout,
+    /// A segment that refinement made of another episode.
+    Refined,
+}
+
+/// Where an episode comes from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Origin {
+    /// Task pair, for example `nut_assembly`.
+    pub task: String,
+    /// Which task of the pair was being done while recording.
+    pub direction: Direction,
+    /// Demonstration, rollout or refined segment.
+    pub kind: Kind,
+    /// Iteration of the loop that made it; 0 for initial demonstrations.
+    pub iteration: u32,
+    /// Index of the episode within its kind and iteration.
+    pub episode: u32,
+    /// Run seed.
+    pub seed: u64,
+    /// True when time runs backwards against the recording.
+    pub reversed: bool,
+}
+
+impl Origin {
+    /// Origin of a scripted demonstration.
+    #[must_use]
+    pub fn demonstration(task: &str, direction: Direction, episode: u32, seed: u64) -> Self {
+        Self {
+            task: task.to_owned(),
+            direction,
+            kind: Kind::Demonstration,
+            iteration: 0,
+            episode,
+            seed,
+            reversed: false,
+        }
+    }
+}
+
+/// One camera image. Shapes: `data` is (height, width, 3), row-major, 8 bits a channel.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Image {
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// RGB bytes.
+    pub data: Vec<u8>,
+}
+
+/// What a policy sees at one control step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Observation {
+    /// Low-dimensional state.
+    pub state: State,
+    /// One image a camera, in the order of the environment's camera names.
+    pub frames: Vec<Image>,
+}
+
+/// All images of one camera over an episode. Shapes: `data` is (T, height, width, 3).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Frames {
+    /// Camera name.
+    pub camera: String,
+    /// Rows.
+    pub height: usize,
+    /// Columns.
+    pub width: usize,
+    /// RGB bytes of all images, one after the other.
+    pub data: Vec<u8>,
+}
+
+impl Frames {
+    /// Bytes of image `row`; empty when there is no such row.
+    #[must_use]
+    pub fn image(&self, row: usize) -> &[u8] {
+        let n = self.height * self.width * 3;
+        self.data.get(row * n..(row + 1) * n).unwrap_or(&[])
+    }
+}
+
+/// One recorded episode, by column; row t of every column is one control step.
+///
+/// # Shapes
+/// `state` (T, 15), `action` (T, 8), `frames` one entry a camera (T, H, W, 3), `source` (T).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Episode {
+    /// State before the action of the same row.
+    pub state: Vec<State>,
+    /// Action taken in this row.
+    pub action: Vec<Action>,
+    /// Images seen before the action of the same row.
+    pub frames: Vec<Frames>,
+    /// Row of the original recording that each row comes from (the nearest one where poses were interpolated).
+    pub source: Vec<u32>,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// True when the last row is the end of the task, so that a policy may repeat the last action after it; false for a
+    /// segment that was cut out of a longer path.
+    pub terminal: bool,
+    /// Where it comes from.
+    pub origin: Origin,
+}
+
+impl Episode {
+    /// An episode without rows. `cameras` names the images that every observation will bring.
+    #[must_use]
+    pub fn new(origin: Origin, cameras: &[String]) -> Self {
+        Self {
+            state: vec![],
+            action: vec![],
+            frames: cameras
+                .iter()
+                .map(|camera| Frames { camera: camera.clone(), height: 0, width: 0, data: vec![] })
+                .collect(),
+            source: vec![],
+            outcome: Outcome::Timeout,
+            terminal: true,
+            origin,
+        }
+    }
+
+    /// Rows, T.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.state.len()
+    }
+
+    /// True without rows.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.state.is_empty()
+    }
+
+    /// Appends one control step.
+    ///
+    /// # Errors
+    /// When the number of images or their size differs from the rows before.
+    pub fn push(&mut self, observation: &Observation, action: &Action) -> Result<()> {
+        if observation.frames.len() != self.frames.len() {
+            return Err(Error::Cameras { expected: self.frames.len(), found: observation.frames.len() });
+        }
+        for (column, image) in self.frames.iter_mut().zip(&observation.frames) {
+            if self.state.is_empty() {
+                (column.height, column.width) = (image.height, image.width);
+            }
+            if (column.height, column.width) != (image.height, image.width) {
+                return Err(Error::ImageSize {
+                    camera: column.camera.clone(),
+                    expected: (column.height, column.width),
+                    found: (image.height, image.width),
+                });
+            }
+            column.data.extend_from_slice(&image.data);
+        }
+        #[allow(clippy::cast_possible_truncation, reason = "episodes are far shorter than 2^32 rows")]
+        self.source.push(self.state.len() as u32);
+        self.state.push(observation.state);
+        self.action.push(*action);
+        Ok(())
+    }
+
+    /// The rows `rows` in that order, as a new episode; poses and images are copied, never blended.
+    /// Rows outside the episode are left out. `terminal` is kept only when the last row is taken last.
+    #[must_use]
+    pub fn select(&self, rows: &[usize]) -> Self {
+        let rows: Vec<usize> = rows.iter().copied().filter(|&r| r < self.len()).collect();
+        Self {
+            state: rows.iter().map(|&r| self.state[r]).collect(),
+            action: rows.iter().map(|&r| self.action[r]).collect(),
+            frames: self
+                .frames
+                .iter()
+                .map(|f| Frames {
+                    camera: f.camera.clone(),
+                    height: f.height,
+                    width: f.width,
+                    data: rows.iter().flat_map(|&r| f.image(r).iter().copied()).collect(),
+                })
+                .collect(),
+            source: rows.iter().map(|&r| self.source[r]).collect(),
+            outcome: self.outcome,
+            terminal: self.terminal && rows.last().is_some_and(|&r| r + 1 == self.len()),
+            origin: self.origin.clone(),
+        }
+    }
+
+    /// Pose of the tool centre point in row `t`.
+    #[must_use]
+    pub fn eef(&self, t: usize) -> Pose {
+        Pose::from_row(&self.state[t][..7])
+    }
+
+    /// Gripper opening in row `t`, m.
+    #[must_use]
+    pub fn opening(&self, t: usize) -> f32 {
+        self.state[t][STATE_DIM - 1]
+    }
+
+    /// Checks that columns agree in length and all numbers are finite.
+    ///
+    /// # Errors
+    /// Names the first column that does not fit.
+    pub fn validate(&self) -> Result<()> {
+        let rows = |column: &str, found: usize| {
+            if found == self.len() {
+                Ok(())
+            } else {
+                Err(Error::Rows { column: column.to_owned(), expected: self.len(), found })
+            }
+        };
+        rows("action", self.action.len())?;
+        rows("source", self.source.len())?;
+        for f in &self.frames {
+            let n = (f.height * f.width * 3).max(1);
+            rows(&f.camera, if f.data.len() % n == 0 { f.data.len() / n } else { usize::MAX })?;
+        }
+        let finite = |column, row, values: &[f32]| {
+            if values.iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Error::NotFinite { column, row }) }
+        };
+        for t in 0..self.len() {
+            finite("state", t, &self.state[t])?;
+            finite("action", t, &self.action[t])?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn observation(v: f32, side: usize) -> Observation {
+        let image = Image { height: side, width: side, data: vec![v as u8; side * side * 3] };
+        Observation { state: [v; STATE_DIM], frames: vec![image] }
+    }
+
+    fn episode(rows: usize) -> Episode {
+        let mut e =
+            Episode::new(Origin::demonstration("t", Direction::Easy, 0, 1), &["table".to_owned()]);
+        for t in 0..rows {
+            e.push(&observation(t as f32, 2), &[t as f32; ACTION_DIM]).unwrap();
+        }
+        e
+    }
+
+    #[test]
+    fn select_copies_rows_in_order_and_keeps_their_source() {
+        let e = episode(5);
+        let s = e.select(&[4, 1, 9]);
+        assert_eq!(s.source, [4, 1]);
+        assert_eq!(s.frames[0].image(1), &[1; 12]);
+        assert!(!s.terminal);
+        assert!(e.select(&[0, 4]).terminal);
+        s.validate().unwrap();
+    }
+
+    #[test]
+    fn push_refuses_other_images() {
+        let mut e = episode(1);
+        assert!(matches!(e.push(&observation(0.0, 3), &[0.0; 8]), Err(Error::ImageSize { .. })));
+        let none = Observation { state: [0.0; STATE_DIM], frames: vec![] };
+        assert!(matches!(e.push(&none, &[0.0; 8]), Err(Error::Cameras { expected: 1, found: 0 })));
+    }
+
+    #[test]
+    fn validate_names_the_bad_column() {
+        let mut e = episode(3);
+        e.action[2][4] = f32::NAN;
+        assert!(matches!(e.validate(), Err(Error::NotFinite { column: "action", row: 2 })));
+        e.action.pop();
+        assert!(matches!(e.validate(), Err(Error::Rows { expected: 3, found: 2, .. })));
+    }
+}

@@ -1,0 +1,131 @@
+//! What a run measured: the rows of the success curve and everything that is written as `results.json`.
+
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// Success over a number of trials.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Evaluation {
+    /// Trials that succeeded, k.
+    pub successes: usize,
+    /// Trials, n.
+    pub trials: usize,
+    /// 95 % Wilson interval of the success rate.
+    pub wilson95: [f64; 2],
+    /// Mean control steps of the successful trials; 0 without one.
+    pub mean_steps: f64,
+    /// Wall time, s.
+    pub seconds: f64,
+}
+
+/// One row of the success curve. Row 0 is the initial policy (the paper's "iteration 1").
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct IterationRecord {
+    /// Number of updates behind this policy.
+    pub iteration: u32,
+    /// The hard policy after this iteration's update, from external resets at seeds that training never saw.
+    pub evaluation: Evaluation,
+    /// Minutes since the run started (its own time only, also across resumes).
+    pub minutes: f64,
+    /// Minutes a stage of this iteration: `collect`, `refine`, `critic`, `train`, `evaluate`, ...
+    pub stage_minutes: BTreeMap<String, f64>,
+    /// Closed-loop collection that fed this update; none for the initial policy.
+    pub collection: Option<Collection>,
+    /// Mean training loss over the last hundred steps.
+    pub loss: f64,
+    /// True when nothing was accepted and the update was skipped.
+    pub skipped: bool,
+}
+
+/// What one round of closed-loop collection brought and what refinement made of it.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Collection {
+    /// Cycles of a hard and an easy rollout.
+    pub cycles: usize,
+    /// Hard rollouts that succeeded, of `cycles`.
+    pub hard_successes: usize,
+    /// Easy rollouts that succeeded.
+    pub easy_successes: usize,
+    /// Easy rollouts started.
+    pub easy_rollouts: usize,
+    /// External resets by cause, for example `hard_failed`, `easy_failed`, `diverged`, `start`.
+    pub resets: BTreeMap<String, usize>,
+    /// Easy rollouts whose reversal passed the gripper gate.
+    pub accepted: usize,
+    /// Frames of the accepted reversals by fate; the values add up to the frames that went in.
+    pub fates: BTreeMap<String, usize>,
+    /// Segments that went into training from this round.
+    pub segments: usize,
+    /// Frames that went into training from this round.
+    pub frames_kept: usize,
+    /// Mean validation loss of the critic; none when the critic stage was skipped.
+    pub critic_loss: Option<f64>,
+    /// Why a stage was skipped, in words; empty when none was.
+    pub notes: Vec<String>,
+}
+
+impl Collection {
+    /// Share of cycles that needed no external reset, in [0, 1] (the paper's automatic-reset rate).
+    #[must_use]
+    pub fn automatic_reset_rate(&self) -> f64 {
+        let resets: usize =
+            self.resets.iter().filter(|(cause, _)| *cause != "start").map(|(_, n)| n).sum();
+        if self.cycles == 0 { 0.0 } else { 1.0 - (resets.min(self.cycles) as f64 / self.cycles as f64) }
+    }
+}
+
+/// `results.json` of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunResults {
+    /// Task pair.
+    pub task: String,
+    /// Variant of the task.
+    pub variant: String,
+    /// Preset name.
+    pub preset: String,
+    /// Run seed.
+    pub seed: u64,
+    /// Version of this library that made the run.
+    pub version: String,
+    /// Threads that ran, and the processor's name where the system tells it.
+    pub machine: String,
+    /// The success curve.
+    pub iterations: Vec<IterationRecord>,
+    /// Mean control steps of a scripted demonstration, easy direction (the paper's cost table).
+    pub demonstration_steps: f64,
+}
+
+/// The 95 % Wilson score interval of `k` successes in `n` trials; (0, 1) without trials.
+#[must_use]
+pub fn wilson95(k: usize, n: usize) -> [f64; 2] {
+    if n == 0 {
+        return [0.0, 1.0];
+    }
+    let (k, n, z) = (k as f64, n as f64, 1.959_963_984_540_054_f64);
+    let p = k / n;
+    let centre = (p + z * z / (2.0 * n)) / (1.0 + z * z / n);
+    let half = z / (1.0 + z * z / n) * (p * (1.0 - p) / n + z * z / (4.0 * n * n)).sqrt();
+    [(centre - half).max(0.0), (centre + half).min(1.0)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wilson_matches_published_intervals() {
+        // 85 of 100 and 53 of 160 as the paper prints them.
+        for (k, n, lo, hi) in [(85, 100, 0.767, 0.907), (53, 160, 0.263, 0.407)] {
+            let [a, b] = wilson95(k, n);
+            assert!((a - lo).abs() < 6e-4 && (b - hi).abs() < 6e-4, "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn automatic_resets_leave_the_first_placement_out() {
+        let mut c = Collection { cycles: 10, ..Collection::default() };
+        c.resets.insert("start".to_owned(), 8);
+        c.resets.insert("easy_failed".to_owned(), 2);
+        assert!((c.automatic_reset_rate() - 0.8).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,99 @@
+use crate::gripper::open_states;
+use e2h_core::{Action, Episode, Pose};
+use serde::{Deserialize, Serialize};
+
+/// How actions are rebuilt from a path.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReverseConfig {
+    /// The goal of step t is the pose at t + `lookahead`; control steps. 1 is the paper's (Eq. 4); more makes up for a
+    /// controller that lags.
+    pub lookahead: usize,
+    /// Opening of the fully open gripper, m. The hand's own figure: 0.08 for the Panda.
+    pub open_width_m: f64,
+    /// The gripper counts as open above this fraction of `open_width_m`.
+    pub open_at: f64,
+    /// The gripper counts as closed below this fraction of `open_width_m`.
+    pub close_at: f64,
+    /// Quaternions are written in the hemisphere of this one (wxyz); the task's reference.
+    pub reference_quaternion: [f64; 4],
+}
+
+impl Default for ReverseConfig {
+    fn default() -> Self {
+        Self {
+            lookahead: 1,
+            open_width_m: 0.08,
+            open_at: 0.95,
+            close_at: 0.85,
+            reference_quaternion: [0.0, 1.0, 0.0, 0.0],
+        }
+    }
+}
+
+impl ReverseConfig {
+    /// All problems with the values.
+    #[must_use]
+    pub fn validate(&self) -> Vec<String> {
+        let mut problems = vec![];
+        if self.lookahead == 0 {
+            problems.push("lookahead: expected at least 1 control step, got 0".to_owned());
+        }
+        if !(self.open_width_m > 0.0 && self.open_width_m.is_finite()) {
+            problems.push(format!("open_width_m: expected a positive opening, m, got {}", self.open_width_m));
+        }
+        if !(0.0 < self.close_at && self.close_at <= self.open_at && self.open_at < 1.0) {
+            problems.push(format!(
+                "close_at, open_at: expected 0 < close_at <= open_at < 1, got {} and {}",
+                self.close_at, self.open_at
+            ));
+        }
+        let norm = self.reference_quaternion.iter().map(|v| v * v).sum::<f64>().sqrt();
+        if !((norm - 1.0).abs() < 1e-3) {
+            problems.push(format!("reference_quaternion: expected norm 1, got {norm}"));
+        }
+        problems
+    }
+}
+
+/// The episode backwards, as a candidate for the other task: states and images in reversed order, actions rebuilt.
+///
+/// `source` goes on naming rows of the recording, and `outcome` stays the recording's, its row included. `terminal` stays
+/// too: the end of the reversed path is where the recording began.
+///
+/// # Source
+/// Eq. 3 and 4.
+#[must_use]
+pub fn reverse(episode: &Episode, config: &ReverseConfig) -> Episode {
+    let rows: Vec<usize> = (0..episode.len()).rev().collect();
+    let mut reversed = episode.select(&rows);
+    reversed.terminal = episode.terminal;
+    reversed.origin.reversed = !episode.origin.reversed;
+    rebuild_actions(&mut reversed, config);
+    reversed
+}
+
+/// Replaces the actions by the poses and openings that follow: the goal of step t is the pose at t + `lookahead` (the last
+/// pose where the path ends before), the gripper command that of the next row's opening.
+///
+/// # Source
+/// Eq. 4. The command follows the observed opening and not the recorded command, which runs ahead of it; and it is never
+/// the width itself, because a gripper told to close to the width of the object does not squeeze it.
+pub fn rebuild_actions(episode: &mut Episode, config: &ReverseConfig) {
+    let poses: Vec<Pose> = (0..episode.len()).map(|t| episode.eef(t)).collect();
+    episode.action = goals(&poses, &open_states(episode, config), config);
+}
+
+/// One action a pose. Shapes: `open` has the length of `poses`.
+pub(crate) fn goals(poses: &[Pose], open: &[bool], config: &ReverseConfig) -> Vec<Action> {
+    let last = poses.len().saturating_sub(1);
+    // Several steps have the same goal only at the end, so rows are made once and looked up.
+    let rows: Vec<[f32; 7]> = poses.iter().map(|p| p.to_row(&config.reference_quaternion)).collect();
+    let goal = |t: usize| {
+        let mut action = [0.0; 8];
+        action[..7].copy_from_slice(&rows[(t + config.lookahead).min(last)]);
+        action[7] = f32::from(u8::from(open[(t + 1).min(last)]));
+        action
+    };
+    (0..poses.len()).map(goal).collect()
+}

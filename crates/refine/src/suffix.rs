@@ -1,0 +1,67 @@
+use crate::advantage::{check_values, split};
+use crate::series::runs;
+use crate::{Fate, Refined, Result};
+use e2h_core::Episode;
+use serde::{Deserialize, Serialize};
+
+/// Whether and where an episode ends early because its goal is reached.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SuffixConfig {
+    /// For pairs that need no release only: elsewhere letting go and moving away is part of success. Optional in the paper.
+    pub enabled: bool,
+    /// The goal counts as reached at this value and above.
+    pub value: f32,
+    /// For this many frames in a row.
+    pub frames: usize,
+    /// Frames kept after those.
+    pub keep: usize,
+    /// With fewer successful hard rollouts in the iteration the value is not trusted; for the caller, who counts them.
+    pub min_successes: usize,
+}
+
+impl Default for SuffixConfig {
+    fn default() -> Self {
+        Self { enabled: false, value: 0.9, frames: 5, keep: 20, min_successes: 3 }
+    }
+}
+
+impl SuffixConfig {
+    /// All problems with the values.
+    #[must_use]
+    pub fn validate(&self) -> Vec<String> {
+        let mut problems = vec![];
+        if !self.value.is_finite() {
+            problems.push(format!("value: expected a finite number, got {}", self.value));
+        }
+        if self.frames == 0 {
+            problems.push("frames: expected at least 1, got 0".to_owned());
+        }
+        problems
+    }
+}
+
+/// Cuts what follows once the goal is reached. The cut end counts as the end of the task.
+///
+/// # Errors
+/// When values and frames do not agree in number, or a value is not finite.
+///
+/// # Source
+/// "We optionally truncate the suffix after it enters a high-value region"; the numbers are ours.
+pub fn cut_suffix(episode: &Episode, values: &[f32], config: &SuffixConfig) -> Result<Refined> {
+    check_values(0, episode.len(), values)?;
+    let high: Vec<bool> = values.iter().map(|&v| v >= config.value).collect();
+    let goal = runs(&high, true).into_iter().find(|run| run.len() >= config.frames);
+    let end = match goal {
+        Some(run) if config.enabled => (run.start + config.frames + config.keep).min(episode.len()),
+        _ => episode.len(),
+    };
+    let mut fates = vec![Fate::Kept; episode.len()];
+    fates[end..].fill(Fate::AfterGoal);
+    let mut refined = split(episode, fates);
+    for segment in &mut refined.segments {
+        segment.terminal = episode.terminal;
+    }
+    refined.value = Some(values.to_vec());
+    Ok(refined)
+}

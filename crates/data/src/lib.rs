@@ -1,1 +1,42 @@
-//! Episodes on disk, training windows and the min-max normaliser of Auto-E2H
+//! Episodes on disk, training windows and the min-max normaliser of Auto-E2H.
+//!
+//! Knows neither Candle nor MuJoCo, and nothing of what is learned: a window is a list of row numbers, a batch a list of
+//! windows. Whoever trains copies the rows where its tensors are.
+//!
+//! ```
+//! use e2h_core::{Direction, Episode, Observation, Origin};
+//! use e2h_data::{EpisodeStore, Normaliser, NormaliserConfig, WindowConfig, Windows};
+//!
+//! let mut episode = Episode::new(Origin::demonstration("nut_assembly", Direction::Easy, 0, 42), &[]);
+//! for t in 0..20 {
+//!     episode.push(&Observation { state: [t as f32; 15], frames: vec![] }, &[t as f32; 8])?;
+//! }
+//! let folder = tempfile::tempdir()?;
+//! let store = EpisodeStore::open(folder.path())?;
+//! store.write("easy_000", &episode)?;
+//! let episodes = vec![store.read("easy_000")?];
+//!
+//! let normaliser = Normaliser::fit(&episodes, &NormaliserConfig::default())?;
+//! assert_eq!(normaliser.normalise_state(&episodes[0].state[19])[0], 1.0);
+//!
+//! let windows = Windows::new(&episodes, &WindowConfig::default());
+//! let window = windows.window(0);
+//! assert_eq!(window.observations, [0, 0]);
+//! assert_eq!(window.actions, (0..16).collect::<Vec<_>>());
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod crop;
+mod error;
+mod file;
+mod normalise;
+mod sample;
+mod store;
+mod window;
+
+pub use crop::Crop;
+pub use error::{Error, Result};
+pub use normalise::{Normaliser, NormaliserConfig};
+pub use sample::{Pick, Sampler, Set};
+pub use store::{EpisodeStore, Summary};
+pub use window::{Alignment, Window, WindowConfig, Windows};

@@ -49,7 +49,7 @@ impl ReverseConfig {
             ));
         }
         let norm = self.reference_quaternion.iter().map(|v| v * v).sum::<f64>().sqrt();
-        if !((norm - 1.0).abs() < 1e-3) {
+        if !(0.999..=1.001).contains(&norm) {
             problems.push(format!("reference_quaternion: expected norm 1, got {norm}"));
         }
         problems

@@ -1,0 +1,88 @@
+use std::path::PathBuf;
+
+/// What can go wrong with data.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// The file system refused.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// On which file or folder.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A file is not what it should be.
+    #[error("{}: {what}: expected {expected}, found {found}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Which part of it.
+        what: String,
+        /// What should be there.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+    /// A name that could leave the folder or collide with temporary files.
+    #[error("episode name: expected letters, digits, `_`, `-` and inner `.`, found `{found}`")]
+    Name {
+        /// The name.
+        found: String,
+    },
+    /// The episode contradicts itself.
+    #[error("episode `{name}`: {source}")]
+    Episode {
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        source: e2h_core::Error,
+    },
+    /// Several files of a store are not what they should be.
+    #[error("{} file(s) cannot be used:\n{}", problems.len(), problems.join("\n"))]
+    Store {
+        /// One line a file.
+        problems: Vec<String>,
+    },
+    /// Ranges cannot be taken from nothing.
+    #[error("normaliser: expected episodes with rows, found none")]
+    NoRows,
+    /// A range is not finite or not positive.
+    #[error("normaliser: {column} entry {index}: expected finite ends with min < max, found {min} and {max}")]
+    Range {
+        /// `state` or `action`.
+        column: &'static str,
+        /// Entry of the row.
+        index: usize,
+        /// Lower end.
+        min: f32,
+        /// Upper end.
+        max: f32,
+    },
+    /// A list of numbers has the wrong length.
+    #[error("normaliser: expected {expected} numbers, found {found}")]
+    Length {
+        /// Numbers needed.
+        expected: usize,
+        /// Numbers given.
+        found: usize,
+    },
+    /// A crop does not fit into its image.
+    #[error("crop: expected at most the image, {height} x {width}, found {size} x {size}")]
+    Crop {
+        /// Rows of the image.
+        height: usize,
+        /// Columns of the image.
+        width: usize,
+        /// Side of the crop.
+        size: usize,
+    },
+    /// There is nothing to draw from.
+    #[error("sampler: expected windows in at least one set, found none")]
+    NoWindows,
+}
+
+/// Shorthand for a result with this crate's [`enum@Error`].
+pub type Result<T> = std::result::Result<T, Error>;

@@ -155,7 +155,7 @@ fn panel(
 /// Minutes of every stage as a stacked bar an iteration.
 #[must_use]
 pub fn stage_times(results: &RunResults) -> String {
-    let order = ["collect", "refine", "critic", "train", "evaluate"];
+    let order = ["demonstrations", "train easy", "collect", "refine", "critic", "train", "evaluate"];
     let mut stages: Vec<String> = results
         .iterations
         .iter()

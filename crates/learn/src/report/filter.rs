@@ -62,7 +62,8 @@ impl FilterPicture {
 
     /// The picture: sampled images on top, then value, advantage, dynamics error and speed over time with their
     /// thresholds, all on bands that show the fates (green kept, forward hatch static, backward hatch resampled, red
-    /// low advantage, grey too short), then the totals.
+    /// low advantage, grey too short), then the totals. A slow run is painted whole; the totals count its frames as they
+    /// are.
     ///
     /// # Errors
     /// When an image cannot be encoded.
@@ -76,8 +77,8 @@ impl FilterPicture {
         let (images, mut top) = self.images()?;
         let mut s = fate::patterns(&prefix) + &images;
         let slow = [(self.static_speed, "static"), (self.slow_speed, "slow")];
-        let advantage: Vec<_> = self.advantage_threshold.map(|t| (t, "drop below")).into_iter().collect();
-        let error: Vec<_> = self.dynamics_threshold.map(|t| (t, "drop above")).into_iter().collect();
+        let advantage: Vec<_> = self.advantage_threshold.map(|t| (t, "min")).into_iter().collect();
+        let error: Vec<_> = self.dynamics_threshold.map(|t| (t, "max")).into_iter().collect();
         let curves: [Curve; 4] = [
             ("value", self.value.as_ref(), &[]),
             ("advantage", self.advantage.as_ref(), &advantage),
@@ -183,8 +184,28 @@ impl FilterPicture {
         }
     }
 
+    /// The fate that each frame is painted with. Re-timing keeps every second or third frame of a slow run; the whole
+    /// run is painted as resampled, as stripes of one frame could not be read.
+    fn band_ranks(&self) -> Vec<usize> {
+        const LONGEST_GAP: usize = 2;
+        let (kept, resampled) = (fate::rank("kept"), fate::rank("resampled"));
+        let mut ranks: Vec<usize> = self.fates.iter().zip(&self.times).map(|(f, _)| fate::rank(f)).collect();
+        let mut last = None;
+        for t in 0..ranks.len() {
+            if ranks[t] != resampled {
+                continue;
+            }
+            let gap = last.map_or(t, |l: usize| l + 1)..t;
+            if gap.len() <= LONGEST_GAP && ranks[gap.clone()].iter().all(|r| *r == kept) {
+                ranks[gap].fill(resampled);
+            }
+            last = Some(t);
+        }
+        ranks
+    }
+
     fn bands(&self, axes: &Axes, prefix: &str) -> String {
-        let ranks: Vec<usize> = self.fates.iter().zip(&self.times).map(|(f, _)| fate::rank(f)).collect();
+        let ranks = self.band_ranks();
         let (mut s, mut start) = (String::new(), 0);
         for run in ranks.chunk_by(|a, b| a == b) {
             let end = start + run.len() - 1;
@@ -208,7 +229,7 @@ impl FilterPicture {
 
 fn curve(axes: &Axes, times: &[f32], values: &[f32], name: &str) -> String {
     let points = times.iter().zip(values).map(|(t, v)| (f64::from(*t), f64::from(*v)));
-    axes.grid(&ticks(axes.y.0, axes.y.1, 3.0), number)
+    axes.grid(&ticks(axes.y.0, axes.y.1, 4.0), number)
         + &axes.side_name(14.0, name)
         + &axes.line(points, "stroke=\"var(--ink)\" stroke-width=\"1.8\"")
 }
@@ -258,6 +279,21 @@ mod tests {
         assert!((widths / panels as f64 - PLOT).abs() < 2.0, "{widths}");
         assert_eq!(svg.matches("<image ").count(), 8);
         assert_eq!(svg, picture.svg().unwrap());
+    }
+
+    #[test]
+    fn a_re_timed_run_is_one_band() {
+        let fates = "kkkrkrrkkrkkkrsr".chars().map(|c| match c {
+            'r' => "resampled",
+            's' => "static",
+            _ => "Kept",
+        });
+        let fates: Vec<String> = fates.map(str::to_owned).collect();
+        let times = (0..fates.len()).map(|t| t as f32).collect();
+        let picture = FilterPicture { fates, times, ..FilterPicture::default() };
+        let painted: String = picture.band_ranks().iter().map(|r| ["k", "r", "s"][*r]).collect();
+        assert_eq!(painted, "kkkrrrrrrrkkkrsr");
+        assert_eq!(picture.totals()["resampled"], 6);
     }
 
     #[test]

@@ -33,8 +33,8 @@ pub fn html(results: &RunResults, config_toml: &str, pictures: &Pictures) -> Str
     body += &section("Success by iteration", &figure("", &chart::success_curve(&[results])));
     body += &section("Evaluation", &evaluation_table(results));
     if results.iterations.iter().any(|r| r.collection.is_some()) {
-        let below = "<p class=\"note\">Frames of the accepted reversals by what became of them. Resampled frames stay, \
-                     at a higher speed; kept frames and these go into training.</p>";
+        let below = "<p class=\"note\">Frames of the accepted reversals by what became of them. Resampled are those \
+                     that were skipped when slow motion was re-timed.</p>";
         let collection = collection_table(results) + &figure("", &chart::fates(results)) + below;
         body += &section("Collection and refinement", &collection);
     }

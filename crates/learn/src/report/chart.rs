@@ -14,9 +14,9 @@ const ITERATION_AXIS: &str = "iteration (0: initial policy)";
 pub fn success_curve(runs: &[&RunResults]) -> String {
     let several = runs.len() > 1;
     let axes = Axes {
-        left: 62.0,
+        left: 70.0,
         top: 30.0,
-        width: WIDTH - 62.0 - if several { 66.0 } else { 24.0 },
+        width: WIDTH - 70.0 - if several { 66.0 } else { 24.0 },
         height: 270.0,
         x: iteration_range(runs),
         y: (0.0, 1.0),
@@ -56,7 +56,7 @@ fn series(axes: &Axes, run: &RunResults, colour: &str, name: &str, several: bool
         let [lo, hi] = r.evaluation.wilson95;
         let (x, y) = (axes.px(f64::from(r.iteration)), axes.py(rate(r)));
         s += &format!(
-            "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{}, iteration {}: {}, 95 % {} to {}</title>\
+            "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{}, iteration {}: {}, 95% {} to {}</title>\
              <path class=\"bar\" stroke-width=\"1.6\" d=\"M{x0} {hi}H{x1}M{x} {hi}V{lo}M{x0} {lo}H{x1}\"/>\
              <circle cx=\"{x}\" cy=\"{y}\" r=\"4\"/></g>",
             escape(name),
@@ -327,7 +327,7 @@ mod tests {
             svg.split("class=\"bar\"").skip(1).map(|t| t.split('"').nth(3).unwrap()).collect();
         assert_eq!(bars.len(), run.iterations.len());
         for (bar, r) in bars.iter().zip(&run.iterations) {
-            // M x0 hi H x1 M x hi V lo M x0 lo H x1, in a plot from 30 (100 %) to 300 (0 %).
+            // M x0 hi H x1 M x hi V lo M x0 lo H x1, in a plot from 30 (100%) to 300 (0%).
             let n = path_numbers(bar);
             let [lo, hi] = r.evaluation.wilson95;
             assert!((n[1] - (300.0 - 270.0 * hi)).abs() < 0.06, "{bar}");

@@ -28,7 +28,7 @@ const fn style(key: &'static str, label: &'static str, colour: &'static str, fil
 /// In the order of the stages, which is the order of legends and bars.
 const STYLES: [Style; 8] = [
     style("kept", "kept", "#2a9d4e", Fill::Solid),
-    style("resampled", "low speed, resampled", "#2f7ed8", Fill::Backward),
+    style("resampled", "low-speed resampled", "#2f7ed8", Fill::Backward),
     style("static", "static", "#6b7684", Fill::Forward),
     style("lowadvantage", "low advantage", "#d64545", Fill::Solid),
     style("dynamicserror", "dynamics error", "#e07b1a", Fill::Solid),
@@ -87,7 +87,7 @@ pub(super) fn prefix(drawn: impl Iterator<Item = u8>) -> String {
     format!("f{hash:016x}-")
 }
 
-/// `120 frames: 80 kept (67 %), 40 static (33 %)`, in the order of the stages; names that are not known come last.
+/// `120 frames: 80 kept (67%), 40 static (33%)`, in the order of the stages; names that are not known come last.
 #[must_use]
 pub(super) fn totals(fates: &BTreeMap<String, usize>) -> String {
     let sum: usize = fates.values().sum();
@@ -119,7 +119,7 @@ mod tests {
     fn totals_follow_the_stages_and_name_the_unknown() {
         let fates = [("static", 25), ("kept", 70), ("eaten", 5), ("too_short", 0)];
         let fates = fates.into_iter().map(|(k, n)| (k.to_owned(), n)).collect();
-        assert_eq!(totals(&fates), "100 frames: 70 kept (70 %), 25 static (25 %), 5 eaten (5 %)");
+        assert_eq!(totals(&fates), "100 frames: 70 kept (70%), 25 static (25%), 5 eaten (5%)");
         assert_eq!(totals(&BTreeMap::new()), "0 frames");
     }
 }

@@ -6,7 +6,7 @@ use e2h_core::Image;
 use std::collections::BTreeMap;
 
 const WIDTH: f64 = 960.0;
-const LEFT: f64 = 66.0;
+const LEFT: f64 = 78.0;
 const PLOT: f64 = WIDTH - LEFT - 96.0;
 const PANEL: f64 = 110.0;
 
@@ -54,7 +54,7 @@ impl FilterPicture {
         totals
     }
 
-    /// The totals in words, for example `120 frames: 80 kept (67 %), 40 static (33 %)`.
+    /// The totals in words, for example `120 frames: 80 kept (67%), 40 static (33%)`.
     #[must_use]
     pub fn totals_text(&self) -> String {
         fate::totals(&self.totals())

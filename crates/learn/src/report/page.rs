@@ -82,7 +82,7 @@ fn summary(results: &RunResults) -> String {
         last.iteration,
         if last.iteration == 1 { "" } else { "s" },
         last.minutes,
-        if apart { " The two 95 % intervals do not overlap." } else { "" }
+        if apart { " The two 95% intervals do not overlap." } else { "" }
     )
 }
 
@@ -142,7 +142,7 @@ fn table(head: &[&str], rows: &[Vec<String>]) -> String {
 }
 
 fn evaluation_table(results: &RunResults) -> String {
-    let head = ["iteration", "success", "rate", "Wilson 95 %", "steps to success", "minutes", "loss"];
+    let head = ["iteration", "success", "rate", "Wilson 95%", "steps to success", "minutes", "loss"];
     let rows: Vec<Vec<String>> = results
         .iterations
         .iter()
@@ -194,8 +194,8 @@ fn collection_table(results: &RunResults) -> String {
     let details: String = collected()
         .map(|(r, c)| {
             let notes: String =
-                c.notes.iter().map(|n| format!(" {}.", escape(n.trim_end_matches('.')))).collect();
-            format!("<li>Iteration {}: {}.{notes}</li>\n", r.iteration, escape(&fate::totals(&c.fates)))
+                c.notes.iter().map(|n| format!("; {}", escape(n.trim_end_matches('.')))).collect();
+            format!("<li>Iteration {}: {}{notes}.</li>\n", r.iteration, escape(&fate::totals(&c.fates)))
         })
         .collect();
     table(&head, &rows) + &format!("<ul class=\"note\">\n{details}</ul>\n")
@@ -287,11 +287,11 @@ mod tests {
         let mut results = sample::results(1, 5);
         assert_eq!(
             summary(&results),
-            "Success on the hard task went from 4/50 (8 %) to 39/50 (78 %) in 4 iterations and 68 minutes. \
-             The two 95 % intervals do not overlap."
+            "Success on the hard task went from 4/50 (8%) to 39/50 (78%) in 4 iterations and 68 minutes. \
+             The two 95% intervals do not overlap."
         );
         results.iterations.truncate(1);
-        assert_eq!(summary(&results), "The initial policy succeeds in 4/50 (8 %) trials, after 11 minutes.");
+        assert_eq!(summary(&results), "The initial policy succeeds in 4/50 (8%) trials, after 11 minutes.");
         results.iterations.clear();
         assert!(html(&results, "", &Pictures::default()).contains("No policy has been evaluated yet."));
     }

@@ -58,7 +58,7 @@ pub(super) fn number(v: f64) -> String {
 
 /// A share in [0, 1] as a percentage.
 pub(super) fn percent(share: f64) -> String {
-    if share.is_finite() { format!("{:.0} %", share * 100.0) } else { "–".to_owned() }
+    if share.is_finite() { format!("{:.0}%", share * 100.0) } else { "–".to_owned() }
 }
 
 /// Round tick positions, about `count` of them, inside [lo, hi].
@@ -68,7 +68,7 @@ pub(super) fn ticks(lo: f64, hi: f64, count: f64) -> Vec<f64> {
         return vec![];
     }
     let power = 10_f64.powf(raw.log10().floor());
-    let step = [1.0, 2.0, 5.0, 10.0].map(|m| m * power).into_iter().find(|s| *s >= raw).unwrap_or(raw);
+    let step = [1.0, 2.0, 2.5, 5.0, 10.0].map(|m| m * power).into_iter().find(|s| *s >= raw).unwrap_or(raw);
     let first = (lo / step - 1e-9).ceil();
     (0..20).map(|i| (first + f64::from(i)) * step).take_while(|t| *t <= hi + step * 1e-9).collect()
 }

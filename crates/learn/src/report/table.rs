@@ -8,7 +8,7 @@ use crate::record::{IterationRecord, RunResults};
 #[must_use]
 pub fn iterations(results: &RunResults) -> String {
     let mut rows =
-        vec![["iteration", "success", "Wilson 95 %", "minutes", "resets", "frames kept"].map(str::to_owned)];
+        vec![["iteration", "success", "Wilson 95%", "minutes", "resets", "frames kept"].map(str::to_owned)];
     rows.extend(results.iterations.iter().map(row));
     let width = |c: usize| rows.iter().map(|r| r[c].chars().count()).max().unwrap_or(0);
     let widths: [usize; 6] = std::array::from_fn(width);
@@ -39,7 +39,7 @@ fn row(r: &IterationRecord) -> [String; 6] {
     ]
 }
 
-/// `21 % to 45 %`.
+/// `21% to 45%`.
 pub(super) fn interval([lo, hi]: [f64; 2]) -> String {
     format!("{} to {}", percent(lo), percent(hi))
 }
@@ -54,7 +54,7 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(lines.len(), 5);
         assert!(lines.iter().all(|l| l.len() == lines[0].len()), "{text}");
-        assert_eq!(lines[2], "        0     4/50   3 % to 19 %     11.0       -            -");
+        assert_eq!(lines[2], "        0     4/50   3% to 19%     11.0       -            -");
         assert!(lines[3].ends_with("24         6090"), "{text}");
     }
 }

@@ -99,13 +99,14 @@ fn end_labels(axes: &Axes, mut ends: Vec<(f64, usize, String)>) -> String {
     s
 }
 
-/// Mean training loss of the policy and validation loss of the critic against the iteration, one colour a run.
+/// Mean training loss of the policy and validation loss of the critic against the iteration, one colour a run; no
+/// point where the stage was skipped.
 #[must_use]
 pub fn losses(runs: &[&RunResults]) -> String {
     let critic = |r: &IterationRecord| r.collection.as_ref().and_then(|c| c.critic_loss).unwrap_or(f64::NAN);
     let gap = 76.0;
     let width = (WIDTH - 2.0 * gap - 20.0) / 2.0;
-    let mut s = panel(runs, gap, width, "policy loss", |r| r.loss);
+    let mut s = panel(runs, gap, width, "policy loss", |r| if r.skipped { f64::NAN } else { r.loss });
     s += &panel(runs, 2.0 * gap + width, width, "critic loss", critic);
     let entries: Vec<(String, String)> =
         names(runs).into_iter().enumerate().map(|(i, n)| (n, colour(i).to_owned())).collect();
@@ -347,6 +348,15 @@ mod tests {
         let svg = success_curve(&[&a, &b]);
         assert!(svg.contains(">peg&lt;1&gt;, seed 2</text>") && !svg.contains(">mean</text>"));
         assert_eq!(svg, success_curve(&[&a, &b]));
+    }
+
+    #[test]
+    fn a_skipped_update_has_no_loss() {
+        let mut run = sample::results(1, 4);
+        let points = |run: &RunResults| losses(&[run]).matches("<circle").count();
+        let before = points(&run);
+        run.iterations[2].skipped = true;
+        assert_eq!(points(&run) + 1, before);
     }
 
     #[test]

@@ -157,7 +157,7 @@ fn evaluation_table(results: &RunResults) -> String {
                 interval(e.wilson95),
                 steps,
                 format!("{:.1}", r.minutes),
-                number(r.loss),
+                if r.skipped { "–".to_owned() } else { number(r.loss) },
             ]
         })
         .collect();

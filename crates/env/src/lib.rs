@@ -1,1 +1,107 @@
-//! MuJoCo task pairs, cameras, control and scripted demonstrators of Auto-E2H
+//! Task pairs in MuJoCo: scenes, resets, success predicates, cameras, control and scripted demonstrators.
+//!
+//! Knows nothing about learning: an environment takes actions and gives observations. The only crate that names MuJoCo.
+//! Everything random is drawn from the generator that is passed in, and the same seed gives the same bytes whatever the
+//! number of environments or threads.
+//!
+//! ```no_run
+//! use e2h_core::{Direction, Origin, stream};
+//! use e2h_env::{Env, EnvConfig, TaskOptions, demonstrate, task};
+//!
+//! let task = task("nut_assembly", &TaskOptions::default())?;
+//! let mut env = Env::new(task.clone(), &EnvConfig::default())?;
+//! let origin = Origin::demonstration(task.name(), Direction::Easy, 0, 42);
+//! let mut rng = stream(42, "demonstration", 0, 0);
+//! let episode = demonstrate(&mut env, Direction::Easy, task.demonstrator(), origin, &mut rng)?;
+//! assert!(episode.outcome.is_success());
+//! # Ok::<(), e2h_env::Error>(())
+//! ```
+
+mod arm;
+mod config;
+mod env;
+mod expert;
+mod logging;
+mod nut;
+mod record;
+mod render;
+mod scene;
+mod sim;
+mod task;
+
+pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
+pub use env::Env;
+pub use expert::{Expert, Phase, Script};
+pub use nut::NutAssembly;
+pub use record::{demonstrate, replay};
+pub use render::Style;
+pub use scene::{TableCamera, compose};
+pub use sim::{MAX_OPENING, SUBSTEPS, Sim};
+pub use task::{Task, registry, task, variants};
+
+/// What can go wrong in an environment.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A name that the registry does not have.
+    #[error("unknown {what} `{name}`: did you mean `{nearest}`? Known: {known}")]
+    Unknown {
+        /// Kind of name.
+        what: &'static str,
+        /// The name asked for.
+        name: String,
+        /// The nearest known one.
+        nearest: String,
+        /// All known ones.
+        known: String,
+    },
+    /// MuJoCo refused something; the message is its own.
+    #[error("MuJoCo: {0}")]
+    MuJoCo(String),
+    /// A scene lacks something that the environment needs.
+    #[error("the scene has no {what} `{name}`")]
+    Missing {
+        /// Kind of thing.
+        what: &'static str,
+        /// Its name.
+        name: String,
+    },
+    /// The arm cannot reach a pose of the task.
+    #[error("the arm cannot reach the {what}: {error:.4} (m plus rad) left over")]
+    Unreachable {
+        /// Which pose.
+        what: &'static str,
+        /// Distance left over, m plus rad.
+        error: f64,
+    },
+    /// An action that no controller can follow.
+    #[error("action: expected {expected}, got {found:?}")]
+    Action {
+        /// What an action has to be.
+        expected: &'static str,
+        /// The action.
+        found: e2h_core::Action,
+    },
+    /// A camera that the scene does not have.
+    #[error("unknown camera `{name}`: the scene has {known}")]
+    Camera {
+        /// The name asked for.
+        name: String,
+        /// All known ones.
+        known: String,
+    },
+    /// A saved state that does not fit.
+    #[error("saved state: expected {expected} numbers, got {found}")]
+    State {
+        /// Numbers expected.
+        expected: usize,
+        /// Numbers found.
+        found: usize,
+    },
+    /// A recording does not fit together.
+    #[error(transparent)]
+    Core(#[from] e2h_core::Error),
+}
+
+/// Shorthand for a result with this crate's [`enum@Error`].
+pub type Result<T> = std::result::Result<T, Error>;

@@ -1,0 +1,126 @@
+use serde::{Deserialize, Serialize};
+
+/// What an [`Env`](crate::Env) is built with, beside its task.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EnvConfig {
+    /// Side of the square images, pixels. 72 on a laptop (cropped to 64), 144 as in the paper (cropped to 128).
+    pub image_size: usize,
+    /// Whether observations bring images.
+    pub cameras: bool,
+    /// Control steps after which a hard episode times out.
+    pub horizon_hard: usize,
+    /// Control steps after which an easy episode times out.
+    pub horizon_easy: usize,
+    /// Control steps in a row that a success predicate has to hold.
+    pub hold_steps: usize,
+    /// Furthest that the goal position moves in one control step, m (0.03 is 0.6 m/s).
+    pub max_goal_step_m: f64,
+    /// Furthest that the goal orientation turns in one control step, rad.
+    pub max_goal_step_rad: f64,
+    /// Standard deviation of the joint noise round the home posture at a reset, rad.
+    pub home_noise_rad: f64,
+}
+
+impl Default for EnvConfig {
+    fn default() -> Self {
+        Self {
+            image_size: 72,
+            cameras: true,
+            horizon_hard: 500,
+            horizon_easy: 500,
+            hold_steps: 10,
+            max_goal_step_m: 0.03,
+            max_goal_step_rad: 0.15,
+            home_noise_rad: 0.01,
+        }
+    }
+}
+
+impl EnvConfig {
+    /// The defaults without images: for physics alone.
+    #[must_use]
+    pub fn blind() -> Self {
+        Self { cameras: false, ..Self::default() }
+    }
+}
+
+/// Which form of a task, and who demonstrates it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TaskOptions {
+    /// Name of the variant; empty for the task's default.
+    pub variant: String,
+    /// The scripted demonstrator.
+    pub demonstrator: DemonstratorConfig,
+}
+
+/// How much like a person the scripted demonstrator moves.
+///
+/// Hesitations and slow phases are the static and low-speed segments that the kinematic filter is for. They fall between
+/// and inside movements; the pauses beside a gripper change are separate ([`Self::grip_dwell_s`]), because a reversed
+/// release needs the time in which the fingers open.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DemonstratorConfig {
+    /// Standard deviation of the free waypoints, m; grasp and placing are exact to a tenth of it.
+    pub waypoint_noise_m: f64,
+    /// Standard deviation of the yaw at free waypoints, rad.
+    pub waypoint_noise_rad: f64,
+    /// Largest sideways bow of a movement, as a fraction of its length.
+    pub bow: f64,
+    /// Speed range from which each movement draws, m/s.
+    pub speed: [f64; 2],
+    /// Acceleration, m/s^2.
+    pub acceleration: f64,
+    /// Chance of a hesitation before a movement.
+    pub pause_probability: f64,
+    /// Range of the length of a hesitation, s.
+    pub pause_s: [f64; 2],
+    /// Chance that a movement has a slow stretch.
+    pub slow_probability: f64,
+    /// Speed range of a slow stretch, m/s.
+    pub slow_speed: [f64; 2],
+    /// Range of the length of a slow stretch, m.
+    pub slow_length_m: [f64; 2],
+    /// Range of the wait before and after a gripper command, s.
+    pub grip_dwell_s: [f64; 2],
+    /// Control steps recorded after completion, with the arm at rest.
+    pub tail: usize,
+}
+
+impl Default for DemonstratorConfig {
+    fn default() -> Self {
+        Self {
+            waypoint_noise_m: 0.004,
+            waypoint_noise_rad: 0.03,
+            bow: 0.08,
+            speed: [0.10, 0.22],
+            acceleration: 0.6,
+            pause_probability: 0.3,
+            pause_s: [0.2, 1.5],
+            slow_probability: 0.25,
+            slow_speed: [0.03, 0.05],
+            slow_length_m: [0.02, 0.05],
+            grip_dwell_s: [0.4, 0.6],
+            tail: 10,
+        }
+    }
+}
+
+impl DemonstratorConfig {
+    /// Without variation: the same straight, even movements every time.
+    #[must_use]
+    pub fn clean() -> Self {
+        Self {
+            waypoint_noise_m: 0.0,
+            waypoint_noise_rad: 0.0,
+            bow: 0.0,
+            speed: [0.18, 0.18],
+            pause_probability: 0.0,
+            slow_probability: 0.0,
+            grip_dwell_s: [0.4, 0.4],
+            ..Self::default()
+        }
+    }
+}

@@ -1,0 +1,293 @@
+use crate::arm::JOINTS;
+use crate::expert::gauss;
+use crate::render::Renderer;
+use crate::{EnvConfig, Error, Result, Sim, Style, Task, logging};
+use e2h_core::{Action, Direction, Image, Observation, Outcome, Pose, Rng, State};
+use mujoco_rs::prelude::MjModel;
+use std::sync::Arc;
+
+const CAMERAS: [&str; 2] = ["table", "wrist"];
+/// Control steps that a new start gets to come to rest.
+const SETTLE: usize = 4;
+/// Control steps in which the gripper opens for certain.
+const OPENING: usize = 8;
+/// Speed of the arm when it homes, m/s.
+const HOMING_SPEED: f64 = 0.4;
+
+/// One environment: a scene, its controller, and the bookkeeping of an episode.
+pub struct Env {
+    task: Arc<dyn Task>,
+    config: EnvConfig,
+    cameras: Vec<String>,
+    sim: Sim,
+    renderer: Renderer,
+    episode: Progress,
+}
+
+/// Where an episode stands.
+#[derive(Debug, Clone, Copy)]
+struct Progress {
+    direction: Direction,
+    steps: usize,
+    held: usize,
+}
+
+impl Env {
+    /// An environment of a task.
+    ///
+    /// # Errors
+    /// When MuJoCo refuses the scene, or the scene lacks what the environment needs.
+    pub fn new(task: Arc<dyn Task>, config: &EnvConfig) -> Result<Self> {
+        logging::install();
+        let model = MjModel::from_xml_string(&task.scene()).map_err(|e| Error::MuJoCo(e.to_string()))?;
+        Self::with_model(task, config, Arc::new(model))
+    }
+
+    /// Another environment of the same task that shares the compiled model; it starts from a scene of its own.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn clone_shared(&self) -> Result<Self> {
+        Self::with_model(self.task.clone(), &self.config, self.sim.model.clone())
+    }
+
+    fn with_model(task: Arc<dyn Task>, config: &EnvConfig, model: Arc<MjModel>) -> Result<Self> {
+        let sim = Sim::new(model, task.object(), &task.home())?;
+        let cameras = if config.cameras { CAMERAS.map(str::to_owned).to_vec() } else { vec![] };
+        let episode = Progress { direction: Direction::Hard, steps: 0, held: 0 };
+        Ok(Self { task, config: config.clone(), cameras, sim, renderer: Renderer::default(), episode })
+    }
+
+    /// The task.
+    #[must_use]
+    pub fn task(&self) -> &Arc<dyn Task> {
+        &self.task
+    }
+
+    /// The configuration.
+    #[must_use]
+    pub fn config(&self) -> &EnvConfig {
+        &self.config
+    }
+
+    /// Names of the cameras in observations; none when images are off.
+    #[must_use]
+    pub fn cameras(&self) -> &[String] {
+        &self.cameras
+    }
+
+    /// The scene, for demonstrators and diagnosis.
+    #[must_use]
+    pub fn sim(&self) -> &Sim {
+        &self.sim
+    }
+
+    /// Control steps after which an episode times out.
+    #[must_use]
+    pub fn horizon(&self, direction: Direction) -> usize {
+        match direction {
+            Direction::Hard => self.config.horizon_hard,
+            Direction::Easy => self.config.horizon_easy,
+        }
+    }
+
+    /// Control steps of this episode so far.
+    #[must_use]
+    pub fn steps(&self) -> usize {
+        self.episode.steps
+    }
+
+    /// An external reset: the arm at home (with a little noise), the object at a start of `direction`; begins an episode.
+    ///
+    /// # Errors
+    /// When the start diverges, which a sound task never does.
+    pub fn reset(&mut self, direction: Direction, rng: &mut Rng) -> Result<()> {
+        let home = self.sim.home_joints();
+        let joints: [f64; JOINTS] = std::array::from_fn(|j| home[j] + gauss(rng, self.config.home_noise_rad));
+        self.sim.clear(&joints);
+        self.task.place(direction, &mut self.sim, rng);
+        let trouble = self.sim.trouble();
+        self.sim.settle(SETTLE);
+        if self.sim.trouble() != trouble {
+            return Err(Error::MuJoCo("the start of an episode diverged".into()));
+        }
+        self.begin(direction)
+    }
+
+    /// Begins an episode of `direction` from the scene as it is.
+    ///
+    /// # Errors
+    /// None at present; kept for environments that refuse some states.
+    pub fn begin(&mut self, direction: Direction) -> Result<()> {
+        self.episode = Progress { direction, steps: 0, held: 0 };
+        Ok(())
+    }
+
+    /// Takes the arm home without a reset: opens the gripper, rises straight up, goes to the home posture. Not part of
+    /// an episode, so its counters stand still.
+    ///
+    /// # Errors
+    /// When the simulation diverges on the way.
+    pub fn home(&mut self) -> Result<()> {
+        let trouble = self.sim.trouble();
+        self.sim.settle_open(OPENING);
+        let home = self.sim.home();
+        let mut above = self.sim.goal();
+        above.position.z = above.position.z.max(home.position.z);
+        for goal in [above, home] {
+            self.travel(&goal);
+        }
+        // The null space is not fixed by the pose: finish at the very posture of a reset.
+        let joints = self.sim.home_joints();
+        for _ in 0..200 {
+            if self.sim.approach_joints(&joints) {
+                break;
+            }
+        }
+        self.sim.settle(SETTLE);
+        if self.sim.trouble() == trouble { Ok(()) } else { Err(Error::MuJoCo("homing diverged".into())) }
+    }
+
+    fn travel(&mut self, goal: &Pose) {
+        let (step, turn) = (HOMING_SPEED / e2h_core::CONTROL_HZ, self.config.max_goal_step_rad);
+        for _ in 0..200 {
+            let here = self.sim.goal();
+            if (here.position - goal.position).norm() < 1e-6
+                && here.orientation.angle_to(&goal.orientation) < 1e-6
+            {
+                break;
+            }
+            self.sim.drive(goal, true, step, turn);
+        }
+    }
+
+    /// What a policy sees now.
+    ///
+    /// # Errors
+    /// When a camera is missing from the scene.
+    pub fn observe(&mut self) -> Result<Observation> {
+        let side = self.config.image_size;
+        let mut frames = Vec::with_capacity(self.cameras.len());
+        for camera in &self.cameras {
+            frames.push(self.renderer.draw(&self.sim.data, camera, side, side, Style::default())?);
+        }
+        Ok(Observation { state: self.state(), frames })
+    }
+
+    /// The low-dimensional state: tool centre point, object, distance between the fingers (0 to 0.08 m).
+    #[must_use]
+    pub fn state(&self) -> State {
+        let mut state = State::default();
+        state[..7].copy_from_slice(&self.sim.tcp().to_row(&self.task.eef_reference()));
+        state[7..14].copy_from_slice(&self.sim.object().to_row(&self.task.object_reference()));
+        #[allow(clippy::cast_possible_truncation, reason = "recorded states are f32")]
+        let opening = self.sim.opening() as f32;
+        state[14] = opening;
+        state
+    }
+
+    /// One control step. The outcome is there when the episode ended with it: success held for
+    /// [`EnvConfig::hold_steps`], the horizon, or a simulation that ran away (which needs a [`Self::reset`]).
+    ///
+    /// # Errors
+    /// An action with a number that is not finite, or a quaternion without direction. Nothing has moved then.
+    pub fn step(&mut self, action: &Action) -> Result<Option<Outcome>> {
+        if self.advance(action)? {
+            return Ok(Some(Outcome::Diverged));
+        }
+        let timeout = self.episode.steps >= self.horizon(self.episode.direction);
+        Ok(self.held().or(timeout.then_some(Outcome::Timeout)))
+    }
+
+    /// Success, if the goal was held long enough up to now.
+    pub(crate) fn held(&self) -> Option<Outcome> {
+        let Progress { steps, held, .. } = self.episode;
+        (held >= self.config.hold_steps.max(1)).then(|| Outcome::Success { at: steps - held })
+    }
+
+    /// One control step without an end; true when the simulation diverged.
+    pub(crate) fn advance(&mut self, action: &Action) -> Result<bool> {
+        check(action)?;
+        let (trouble, time) = (self.sim.trouble(), self.sim.time());
+        let goal = Pose::from_row(&action[..7]);
+        let open = action[7] > 0.5;
+        self.sim.drive(&goal, open, self.config.max_goal_step_m, self.config.max_goal_step_rad);
+        self.episode.steps += 1;
+        if self.sim.trouble() != trouble || self.sim.time() <= time {
+            return Ok(true);
+        }
+        let good = self.task.success(self.episode.direction, &self.sim);
+        self.episode.held = if good { self.episode.held + 1 } else { 0 };
+        Ok(false)
+    }
+
+    /// Whether the scene is in a goal state of `direction` right now.
+    #[must_use]
+    pub fn success(&self, direction: Direction) -> bool {
+        self.task.success(direction, &self.sim)
+    }
+
+    /// The whole state, physics, controller and counters: [`Self::restore`] continues from it bit for bit.
+    #[must_use]
+    pub fn save(&self) -> Vec<f64> {
+        let mut state = self.sim.save();
+        let Progress { direction, steps, held } = self.episode;
+        state.extend([f64::from(u8::from(direction == Direction::Easy)), steps as f64, held as f64]);
+        state
+    }
+
+    /// Back to a state of [`Self::save`], of this or another environment of the same task.
+    ///
+    /// # Errors
+    /// When the length does not fit.
+    pub fn restore(&mut self, state: &[f64]) -> Result<()> {
+        let expected = self.save().len();
+        if state.len() != expected {
+            return Err(Error::State { expected, found: state.len() });
+        }
+        let [easy, steps, held] = *self.sim.restore(state)? else {
+            return Err(Error::State { expected, found: state.len() });
+        };
+        let direction = if easy > 0.5 { Direction::Easy } else { Direction::Hard };
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saved from usize")]
+        let (steps, held) = (steps as usize, held as usize);
+        self.episode = Progress { direction, steps, held };
+        Ok(())
+    }
+
+    /// A picture of any size, drawn as in observations.
+    ///
+    /// # Errors
+    /// An unknown camera.
+    pub fn render(&mut self, camera: &str, width: usize, height: usize) -> Result<Image> {
+        self.render_styled(camera, width, height, Style::default())
+    }
+
+    /// A picture of any size for a report, for example with shadows.
+    ///
+    /// # Errors
+    /// An unknown camera.
+    pub fn render_styled(
+        &mut self,
+        camera: &str,
+        width: usize,
+        height: usize,
+        style: Style,
+    ) -> Result<Image> {
+        self.renderer.draw(&self.sim.data, camera, width, height, style)
+    }
+}
+
+/// Refuses actions before anything moves.
+fn check(action: &Action) -> Result<()> {
+    if !action.iter().all(|v| v.is_finite()) {
+        return Err(Error::Action { expected: "finite numbers", found: *action });
+    }
+    if action[3..7].iter().map(|v| v * v).sum::<f32>() < 1e-6 {
+        return Err(Error::Action {
+            expected: "a quaternion (wxyz) at 3..7 that is not zero",
+            found: *action,
+        });
+    }
+    Ok(())
+}

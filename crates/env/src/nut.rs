@@ -1,0 +1,129 @@
+//! Put a nut with a handle over a peg; take it off.
+
+mod plan;
+mod variant;
+
+use crate::expert::draw;
+use crate::{DemonstratorConfig, Expert, Sim, TableCamera, Task, compose};
+use e2h_core::{Direction, Pose, Rng};
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::Rng as _;
+use std::f64::consts::{PI, TAU};
+pub(crate) use variant::VARIANTS;
+use variant::{NUT_HALF_HEIGHT, PEG_TOP, Variant, Yaw};
+
+/// Widening of the start box in which a nut that was put down counts as taken off, m.
+///
+/// Differs: TR-DRL's easy task ends with the nut held in the air; ours ends where the hard task starts, so that the
+/// reversed data show the grasp from the table. The margin forgives what a hand does when it lets go.
+const BOX_MARGIN: f64 = 0.02;
+/// Largest tilt of a nut that lies flat, as the cosine of its axis with the vertical (2.6 degrees).
+const FLAT: f64 = 0.999;
+/// How far above the nut the tool centre point has to be for the arm to count as away, m.
+const AWAY: f64 = 0.10;
+/// Height above the table of TR-DRL's reference point on the peg, and its tolerance, m.
+const SEAT: (f64, f64) = (0.03, 0.05);
+
+/// The pair `nut_assembly`. Hard: the nut goes from the table over the peg. Easy: it comes off and back to the table.
+///
+/// Variants: `loose` (the round nut of the released TR-DRL scene, about 47 mm a side), `round` and `square` (robosuite's
+/// own, 16 and 7 mm a side).
+///
+/// # Source
+/// TR-DRL (arXiv 2505.13925) and robosuite's pegs arena: shapes, start boxes and predicates.
+/// Differs: the frame is the robot's base with the table top at z = 0, so robosuite's (x, y, z) is (x + 0.56, y, z - 0.82);
+/// `loose` lies 0.10 m further from the robot, because a Panda cannot reach under itself for the handle of the nearest
+/// starts (TR-DRL's arm is a Kinova). Contacts are stiffer than robosuite's, whose default softness lets a nut sink into
+/// its peg.
+#[derive(Debug, Clone)]
+pub struct NutAssembly {
+    variant: &'static Variant,
+    demonstrator: DemonstratorConfig,
+}
+
+impl NutAssembly {
+    pub(crate) fn new(variant: &str, demonstrator: DemonstratorConfig) -> Self {
+        Self { variant: Variant::named(variant), demonstrator }
+    }
+
+    fn in_box(&self, p: &Vector3<f64>) -> bool {
+        let within = |v: f64, [low, high]: [f64; 2]| (low - BOX_MARGIN..=high + BOX_MARGIN).contains(&v);
+        within(p.x, self.variant.start_x) && within(p.y, self.variant.start_y)
+    }
+}
+
+impl Task for NutAssembly {
+    fn name(&self) -> &str {
+        "nut_assembly"
+    }
+
+    fn variant(&self) -> &str {
+        self.variant.name
+    }
+
+    fn scene(&self) -> String {
+        let camera = TableCamera { position: [1.22, -0.62, 0.62], target: [0.56, -0.07, 0.03], fovy: 42.0 };
+        compose(&self.variant.bodies(), &camera)
+    }
+
+    fn object(&self) -> &str {
+        "nut"
+    }
+
+    fn object_reference(&self) -> [f64; 4] {
+        [0.0, 0.0, 0.0, 1.0] // handle towards the robot
+    }
+
+    fn home(&self) -> Pose {
+        Pose::new(Vector3::from(self.variant.home), plan::down(0.0))
+    }
+
+    fn horizon(&self, _: Direction) -> usize {
+        500
+    }
+
+    fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng) {
+        let v = self.variant;
+        let (position, yaw) = match direction {
+            Direction::Hard => ([draw(rng, v.start_x), draw(rng, v.start_y)], v.start_yaw(rng)),
+            Direction::Easy => {
+                let yaw = match v.yaw {
+                    Yaw::Fixed => PI + draw(rng, [-v.peg_yaw, v.peg_yaw]),
+                    Yaw::Uniform => TAU * rng.random::<f64>(),
+                    Yaw::Quarters => {
+                        f64::from(rng.random_range(0..4)) * (PI / 2.0) + draw(rng, [-v.peg_yaw, v.peg_yaw])
+                    }
+                };
+                let [dx, dy] = v.offset(yaw, rng);
+                ([v.peg[0] + dx, v.peg[1] + dy], yaw)
+            }
+        };
+        let orientation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
+        sim.set_object(&Pose::new(Vector3::new(position[0], position[1], NUT_HALF_HEIGHT), orientation));
+    }
+
+    fn success(&self, direction: Direction, sim: &Sim) -> bool {
+        let nut = sim.object();
+        let p = nut.position;
+        let released = sim.released();
+        match direction {
+            Direction::Hard => {
+                let beside =
+                    ((p.x - self.variant.peg[0]).powi(2) + (p.y - self.variant.peg[1]).powi(2)).sqrt();
+                released && beside < self.variant.seat_xy && (p.z - SEAT.0).abs() < SEAT.1 && p.z < PEG_TOP
+            }
+            Direction::Easy => {
+                let flat = (nut.orientation * Vector3::z()).z > FLAT && p.z < 2.0 * NUT_HALF_HEIGHT;
+                released && flat && self.in_box(&p) && sim.tcp().position.z - p.z > AWAY
+            }
+        }
+    }
+
+    fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
+        Box::new(plan::script(self.variant, direction, config, rng))
+    }
+
+    fn demonstrator(&self) -> &DemonstratorConfig {
+        &self.demonstrator
+    }
+}

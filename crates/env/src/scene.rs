@@ -1,0 +1,38 @@
+//! Puts a task's bodies and cameras into the robot's scene.
+
+use nalgebra::Vector3;
+
+const PANDA: &str = include_str!("../assets/panda.xml");
+
+/// A fixed camera called `table`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TableCamera {
+    /// Where it stands, m.
+    pub position: [f64; 3],
+    /// What it looks at, m.
+    pub target: [f64; 3],
+    /// Vertical field of view, degrees.
+    pub fovy: f64,
+}
+
+/// The robot's scene (MJCF) with the bodies of a task (`bodies`, MJCF elements of the world body), the fixed camera
+/// `table` and the camera `wrist` on the hand.
+#[must_use]
+pub fn compose(bodies: &str, camera: &TableCamera) -> String {
+    let table = camera_xml("table", camera.position, camera.target, [0.0, 0.0, 1.0], camera.fovy);
+    // In the frame of the hand z points to the fingertips; the camera looks past them at what they hold.
+    let wrist = camera_xml("wrist", [0.09, 0.0, -0.03], [0.0, 0.0, 0.115], [1.0, 0.0, 0.0], 68.0);
+    PANDA.replace("<!--CAMERAS-->", &table).replace("<!--WRIST-->", &wrist).replace("<!--TASK-->", bodies)
+}
+
+/// A camera element that looks from `position` at `target` with `up` upwards in the image.
+fn camera_xml(name: &str, position: [f64; 3], target: [f64; 3], up: [f64; 3], fovy: f64) -> String {
+    let [eye, target, up] = [position, target, up].map(Vector3::from);
+    let back = (eye - target).normalize();
+    let right = up.cross(&back).normalize();
+    let up = back.cross(&right);
+    format!(
+        r#"<camera name="{name}" pos="{} {} {}" xyaxes="{} {} {} {} {} {}" fovy="{fovy}"/>"#,
+        eye.x, eye.y, eye.z, right.x, right.y, right.z, up.x, up.y, up.z
+    )
+}

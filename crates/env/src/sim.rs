@@ -1,0 +1,309 @@
+use crate::{Error, Result, arm::Arm, arm::JOINTS};
+use e2h_core::Pose;
+use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use std::sync::Arc;
+
+/// Physics steps in one control step: 20 Hz over 2 ms.
+pub const SUBSTEPS: usize = 25;
+/// Opening of the gripper with both fingers fully apart, m.
+pub const MAX_OPENING: f64 = 0.08;
+
+const FINGER_OPEN: f64 = 0.04; // m a finger
+const FINGER_CLOSED: f64 = -0.01; // m; past contact, so that the actuator squeezes
+const STATE: u32 = MjtState::mjSTATE_INTEGRATION as u32; // the one that replays bit-exactly
+const GRIP: usize = JOINTS; // index of the gripper's actuator, and of the first finger joint
+
+/// Where the controller stands: what it commanded last.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Command {
+    /// Goal pose of the tool centre point.
+    pub(crate) goal: Pose,
+    /// Joint targets, rad.
+    pub(crate) joints: [f64; JOINTS],
+    /// Gripper command.
+    pub(crate) open: bool,
+}
+
+/// One simulated scene: what tasks place and judge, and what scripted demonstrators see (all of it).
+///
+/// # Units
+/// Metres, radians, seconds, in the frame of the robot's base.
+pub struct Sim {
+    pub(crate) model: Arc<MjModel>,
+    pub(crate) data: MjData<Arc<MjModel>>,
+    pub(crate) command: Command,
+    arm: Arm,
+    home: Command,
+    tcp: usize,
+    object: usize,
+    object_qpos: usize,
+    object_dof: usize,
+    robot_geoms: Vec<bool>,
+    object_geoms: Vec<bool>,
+}
+
+impl Sim {
+    /// A scene with the arm at the posture that holds the tool centre point at `home`.
+    pub(crate) fn new(model: Arc<MjModel>, object: &str, home: &Pose) -> Result<Self> {
+        let find = |kind, what, name: &str| {
+            model.name_to_id(kind, name).ok_or_else(|| Error::Missing { what, name: name.to_owned() })
+        };
+        let tcp = find(MjtObjBase::mjOBJ_SITE, "site", "tcp")?;
+        let body = find(MjtObjBase::mjOBJ_BODY, "body", object)?;
+        let hand = find(MjtObjBase::mjOBJ_BODY, "body", "hand")?;
+        let joint = model
+            .body_jntadr()
+            .get(body)
+            .and_then(|&j| usize::try_from(j).ok())
+            .ok_or(Error::Missing { what: "free joint of the object", name: object.to_owned() })?;
+        let address = |all: &[i32]| all.get(joint).and_then(|&a| usize::try_from(a).ok()).unwrap_or(0);
+        let (object_qpos, object_dof) = (address(model.jnt_qposadr()), address(model.jnt_dofadr()));
+        let on = |body: usize| model.geom_bodyid().iter().map(|&b| b == body as i32).collect::<Vec<_>>();
+        let robot_geoms =
+            model.geom_bodyid().iter().map(|&b| (hand as i32..=hand as i32 + 2).contains(&b)).collect();
+        let object_geoms = on(body);
+
+        let mut arm = Arm::new(&model, tcp);
+        let (joints, error) = arm.solve(home, &arm.posture(), 200);
+        if error > 1e-4 {
+            return Err(Error::Unreachable { what: "home pose", error });
+        }
+        arm.set_posture(joints);
+        let command = Command { goal: *home, joints, open: true };
+        let data = MjData::new(model.clone());
+        let mut sim = Self {
+            data,
+            command,
+            arm,
+            home: command,
+            tcp,
+            object: body,
+            object_qpos,
+            object_dof,
+            robot_geoms,
+            object_geoms,
+            model,
+        };
+        sim.clear(&joints);
+        Ok(sim)
+    }
+
+    /// Puts everything at rest: the arm at `joints`, the gripper open, the object where the scene has it.
+    pub(crate) fn clear(&mut self, joints: &[f64; JOINTS]) {
+        self.data.reset();
+        let qpos = self.data.qpos_mut();
+        qpos[..JOINTS].copy_from_slice(joints);
+        qpos[GRIP..GRIP + 2].fill(FINGER_OPEN);
+        let ctrl = self.data.ctrl_mut();
+        ctrl[..JOINTS].copy_from_slice(joints);
+        ctrl[GRIP] = FINGER_OPEN;
+        self.command = Command { goal: self.arm.pose(joints), joints: *joints, open: true };
+        self.refresh();
+    }
+
+    /// Brings poses and contacts up to date with the joint positions; leaves the dynamics alone, so that a saved state
+    /// replays bit-exactly.
+    pub(crate) fn refresh(&mut self) {
+        self.data.fwd_position();
+    }
+
+    /// Pose of the tool centre point (between the finger pads), measured.
+    #[must_use]
+    pub fn tcp(&self) -> Pose {
+        site_pose(&self.data, self.tcp)
+    }
+
+    /// The goal pose that the controller follows at the moment.
+    #[must_use]
+    pub fn goal(&self) -> Pose {
+        self.command.goal
+    }
+
+    /// Pose of the tool centre point when the arm is at home.
+    #[must_use]
+    pub fn home(&self) -> Pose {
+        self.home.goal
+    }
+
+    pub(crate) fn home_joints(&self) -> [f64; JOINTS] {
+        self.home.joints
+    }
+
+    /// Pose of the object.
+    #[must_use]
+    pub fn object(&self) -> Pose {
+        let (p, q) = (self.data.xpos()[self.object], self.data.xquat()[self.object]);
+        let q = Quaternion::new(q[0], q[1], q[2], q[3]);
+        Pose::new(Vector3::from(p), UnitQuaternion::try_new(q, 1e-9).unwrap_or_else(UnitQuaternion::identity))
+    }
+
+    /// Speed of the object's frame, m/s.
+    #[must_use]
+    pub fn object_speed(&self) -> f64 {
+        let v = &self.data.qvel()[self.object_dof..self.object_dof + 3];
+        Vector3::from_row_slice(v).norm()
+    }
+
+    /// Distance between the fingers, m, in [0, [`MAX_OPENING`]].
+    #[must_use]
+    pub fn opening(&self) -> f64 {
+        let q = self.data.qpos();
+        (q[GRIP] + q[GRIP + 1]).clamp(0.0, MAX_OPENING)
+    }
+
+    /// Whether hand or fingers touch the object.
+    #[must_use]
+    pub fn touching(&self) -> bool {
+        let of = |set: &[bool], geom: i32| {
+            usize::try_from(geom).is_ok_and(|g| set.get(g).copied().unwrap_or(false))
+        };
+        self.data.contact().iter().any(|c| {
+            let [a, b] = c.geom;
+            c.dist < 0.0
+                && ((of(&self.robot_geoms, a) && of(&self.object_geoms, b))
+                    || (of(&self.robot_geoms, b) && of(&self.object_geoms, a)))
+        })
+    }
+
+    /// Whether the gripper is open and clear of the object.
+    #[must_use]
+    pub fn released(&self) -> bool {
+        self.opening() > 0.9 * MAX_OPENING && !self.touching()
+    }
+
+    /// Puts the object at rest at a pose.
+    pub fn set_object(&mut self, pose: &Pose) {
+        let q = pose.orientation.quaternion();
+        let row = [pose.position.x, pose.position.y, pose.position.z, q.w, q.i, q.j, q.k];
+        let at = self.object_qpos;
+        self.data.qpos_mut()[at..at + 7].copy_from_slice(&row);
+        let at = self.object_dof;
+        self.data.qvel_mut()[at..at + 6].fill(0.0);
+        self.refresh();
+    }
+
+    /// Lets the scene come to rest with the arm held where it is.
+    pub fn settle(&mut self, control_steps: usize) {
+        let Command { joints, open, .. } = self.command;
+        for _ in 0..control_steps {
+            self.drive_joints(&joints, open);
+        }
+    }
+
+    /// The same with the gripper open.
+    pub(crate) fn settle_open(&mut self, control_steps: usize) {
+        self.command.open = true;
+        self.settle(control_steps);
+    }
+
+    /// One control step towards joint targets at a safe speed; true when they are reached.
+    pub(crate) fn approach_joints(&mut self, joints: &[f64; JOINTS]) -> bool {
+        if self.command.joints == *joints {
+            return true;
+        }
+        let most = self.command.joints.iter().zip(joints).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let share = (0.04 / most.max(1e-12)).min(1.0); // 0.8 rad/s
+        let from = self.command.joints;
+        let next = std::array::from_fn(|j| {
+            if share < 1.0 { from[j] + (joints[j] - from[j]) * share } else { joints[j] }
+        });
+        let open = self.command.open;
+        self.drive_joints(&next, open);
+        self.command.goal = self.arm.pose(&next);
+        false
+    }
+
+    /// One control step towards a goal pose that moves and turns at most as far as allowed.
+    pub(crate) fn drive(&mut self, goal: &Pose, open: bool, max_move: f64, max_turn: f64) {
+        let from = self.command.goal;
+        let move_by = (goal.position - from.position).norm();
+        let turn_by = from.orientation.angle_to(&goal.orientation);
+        let share = |by: f64, max: f64| if by > max { max / by } else { 1.0 };
+        let goal = Pose::new(
+            from.interpolate(goal, share(move_by, max_move)).position,
+            from.interpolate(goal, share(turn_by, max_turn)).orientation,
+        );
+        let (joints, _) = self.arm.solve(&goal, &self.command.joints, 20);
+        let joints = self.arm.limit(&joints, &self.command.joints);
+        self.command.goal = goal;
+        self.drive_joints(&joints, open);
+    }
+
+    /// One control step to joint targets, interpolated over the physics steps. The velocity feed-forward cancels the
+    /// damping of actuator and joint, which is what would make the arm lag.
+    pub(crate) fn drive_joints(&mut self, joints: &[f64; JOINTS], open: bool) {
+        let from = self.command.joints;
+        let lead = self.arm.lead();
+        let steps = SUBSTEPS as f64;
+        let dt = self.model.opt().timestep;
+        for k in 1..=SUBSTEPS {
+            let ctrl = self.data.ctrl_mut();
+            for j in 0..JOINTS {
+                let step = joints[j] - from[j];
+                ctrl[j] = from[j] + step * (k as f64 / steps) + lead[j] * step / (steps * dt);
+            }
+            ctrl[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+            self.data.step();
+        }
+        self.command.joints = *joints;
+        self.command.open = open;
+        self.refresh();
+    }
+
+    /// Counts of the warnings with which MuJoCo reports a simulation that ran away; it then resets the state silently.
+    pub(crate) fn trouble(&self) -> i32 {
+        let kinds = [
+            MjtWarning::mjWARN_BADQPOS,
+            MjtWarning::mjWARN_BADQVEL,
+            MjtWarning::mjWARN_BADQACC,
+            MjtWarning::mjWARN_BADCTRL,
+        ];
+        let all = self.data.warning();
+        kinds.into_iter().map(|kind| all[kind as usize].number).sum()
+    }
+
+    /// Simulated time, s.
+    #[must_use]
+    pub fn time(&self) -> f64 {
+        self.data.time()
+    }
+
+    /// Physics and controller as numbers.
+    pub(crate) fn save(&self) -> Vec<f64> {
+        let mut state = self.data.state(STATE).into_vec();
+        let q = self.command.goal.orientation.quaternion();
+        state.extend(self.command.goal.position.iter());
+        state.extend([q.w, q.i, q.j, q.k]);
+        state.extend(self.command.joints);
+        state.push(f64::from(u8::from(self.command.open)));
+        state
+    }
+
+    /// Back to a state of [`Self::save`]; the numbers after it are returned.
+    pub(crate) fn restore<'a>(&mut self, state: &'a [f64]) -> Result<&'a [f64]> {
+        let physics = self.model.state_size(STATE);
+        let expected = physics + 7 + JOINTS + 1;
+        if state.len() < expected {
+            return Err(Error::State { expected, found: state.len() });
+        }
+        let (physics, rest) = state.split_at(physics);
+        self.data.set_state(physics, STATE).map_err(|e| Error::MuJoCo(e.to_string()))?;
+        let q = Quaternion::new(rest[3], rest[4], rest[5], rest[6]);
+        // Unchecked: normalising again would change the last bit of a quaternion that was saved normalised.
+        let orientation = UnitQuaternion::new_unchecked(q);
+        self.command.goal = Pose::new(Vector3::new(rest[0], rest[1], rest[2]), orientation);
+        self.command.joints.copy_from_slice(&rest[7..7 + JOINTS]);
+        self.command.open = rest[7 + JOINTS] > 0.5;
+        self.refresh();
+        Ok(&rest[8 + JOINTS..])
+    }
+}
+
+/// Pose of a site.
+pub(crate) fn site_pose(data: &MjData<Arc<MjModel>>, site: usize) -> Pose {
+    let rotation = nalgebra::Matrix3::from_row_slice(&data.site_xmat()[site]);
+    // Not Rotation3::scaled_axis and friends, which give NaN at half turns; the quaternion conversion is sound.
+    let rotation = nalgebra::Rotation3::from_matrix_unchecked(rotation);
+    Pose::new(Vector3::from(data.site_xpos()[site]), UnitQuaternion::from_rotation_matrix(&rotation))
+}

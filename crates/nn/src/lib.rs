@@ -1,1 +1,58 @@
-//! Candle layers that train on the CPU, their kernels, optimisers and weight files
+//! Networks that learn on the CPU: layers on Candle tensors with kernels of their own, optimisers, weight files.
+//!
+//! Several of Candle's gradients are wrong without an error, and its graph allocates for every gradient that flows. Here a
+//! network's forward pass is one node of Candle's graph with a backward pass of its own, over channels-last buffers and
+//! direct calls to `gemm`. Parameters keep the names and, in files, the layouts of PyTorch.
+//!
+//! The same seed gives the same bytes in any number of threads. Deliberately knows nothing of robots, data or diffusion
+//! schedules.
+//!
+//! ```
+//! use candle_core::{Device, Tensor};
+//! use e2h_nn::{Adam, AdamConfig, Mlp, Mode, Params, backward, mse};
+//! use rand::SeedableRng;
+//! use rand_chacha::ChaCha8Rng;
+//!
+//! let mut rng = ChaCha8Rng::seed_from_u64(0);
+//! let (params, net) = Params::build(Mode::Train, &mut rng, |b| Mlp::new(&[2, 16, 1], 0.0, b))?;
+//! let x = Tensor::new(&[[0f32, 0.], [0., 1.], [1., 0.], [1., 1.]], &Device::Cpu)?;
+//! let y = Tensor::new(&[[0f32], [1.], [1.], [0.]], &Device::Cpu)?;
+//! let mut adam = Adam::new(&AdamConfig::default(), &params)?;
+//! let mut loss = f32::MAX;
+//! for _ in 0..1000 {
+//!     let l = mse(&net.forward(&x, None::<&mut ChaCha8Rng>)?, &y, None)?;
+//!     adam.step(&params, &backward(&l, &params)?, 1e-2)?;
+//!     loss = l.to_scalar()?;
+//! }
+//! assert!(loss < 1e-3);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod error;
+mod grad;
+mod kernel;
+mod layers;
+mod loss;
+mod memory;
+mod mlp;
+mod optim;
+mod params;
+mod rgb;
+mod tape;
+mod unet;
+mod weights;
+
+pub use error::{Error, Result};
+pub use grad::{Grads, backward, backward_many, no_grad};
+pub use layers::{
+    Act, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Relu, SpatialSoftmax, dropout,
+    repeat_rows, sinusoidal_embedding,
+};
+pub use loss::mse;
+pub use memory::tune_allocator;
+pub use mlp::Mlp;
+pub use optim::{Adam, AdamConfig, Ema, EmaConfig, LrSchedule, learning_rate};
+pub use params::{Builder, Mode, Params};
+pub use rgb::{RgbEncoder, RgbEncoderConfig};
+pub use unet::{ConditionalUnet1d, UnetConfig};
+pub use weights::{HostTensor, Weights, load_weights, save_weights};

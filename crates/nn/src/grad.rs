@@ -1,0 +1,166 @@
+use crate::kernel::{self, add_assign};
+use crate::params::{Params, with};
+use crate::weights::Weights;
+use crate::{Error, Result};
+use candle_core::{Tensor, TensorId};
+use std::cell::{Cell, RefCell};
+use std::collections::HashMap;
+
+thread_local! {
+    /// One list per running `backward` of this thread. Another can start while the first waits for a parallel loop.
+    static RUNNING: RefCell<Vec<HashMap<TensorId, Vec<f32>>>> = const { RefCell::new(Vec::new()) };
+    static OFF: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Whether forward passes on this thread may keep a record.
+pub(crate) fn enabled() -> bool {
+    !OFF.get()
+}
+
+/// Runs `f` without keeping anything for a backward pass, even in [`crate::Mode::Train`]: for validation losses.
+pub fn no_grad<R>(f: impl FnOnce() -> R) -> R {
+    struct Restore(bool);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            OFF.set(self.0);
+        }
+    }
+    let _restore = Restore(OFF.replace(true));
+    f()
+}
+
+/// Adds weight gradients to the list of the innermost `backward`.
+pub(crate) fn give(list: Vec<(TensorId, Vec<f32>)>) -> Result<()> {
+    if list.is_empty() {
+        return Ok(());
+    }
+    RUNNING.with_borrow_mut(|r| {
+        let store = r.last_mut().ok_or(Error::NotRecording)?;
+        for (id, g) in list {
+            match store.get_mut(&id) {
+                Some(sum) => add_assign(sum, &g),
+                None => {
+                    store.insert(id, g);
+                }
+            }
+        }
+        Ok(())
+    })
+}
+
+/// The gradients of the parameters of one network.
+#[derive(Debug, Clone)]
+pub struct Grads {
+    /// In the order of the parameters; `None` where the loss does not depend on one.
+    pub(crate) list: Vec<Option<Vec<f32>>>,
+}
+
+impl Grads {
+    /// The Euclidean norm over all parameters.
+    #[must_use]
+    pub fn norm(&self) -> f32 {
+        self.list.iter().flatten().map(|g| kernel::optim::squares(g)).sum::<f64>().sqrt() as f32
+    }
+
+    /// Adds `other`, for a batch that is taken in parts.
+    ///
+    /// # Errors
+    /// [`Error::OtherParams`] when `other` is of another network.
+    pub fn add(&mut self, other: &Self) -> Result<()> {
+        let same = |(a, b): (&Option<Vec<f32>>, &Option<Vec<f32>>)| {
+            a.as_ref().zip(b.as_ref()).is_none_or(|(a, b)| a.len() == b.len())
+        };
+        if self.list.len() != other.list.len() || !self.list.iter().zip(&other.list).all(same) {
+            let (expected, found) = (self.list.len(), other.list.len());
+            return Err(Error::OtherParams { what: "gradients", expected, found });
+        }
+        for (a, b) in self.list.iter_mut().zip(&other.list) {
+            match (a, b) {
+                (Some(a), Some(b)) => add_assign(a, b),
+                (a @ None, Some(b)) => *a = Some(b.clone()),
+                (_, None) => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Multiplies all gradients.
+    pub fn scale(&mut self, factor: f32) {
+        self.list.iter_mut().flatten().flatten().for_each(|g| *g *= factor);
+    }
+
+    /// Gradients by parameter name in PyTorch's layout, zeros where the loss does not depend on one.
+    ///
+    /// # Errors
+    /// [`Error::OtherParams`] when they are of another network.
+    pub fn export(&self, params: &Params) -> Result<Weights> {
+        self.check(params)?;
+        let full = |(g, v): (&Option<Vec<f32>>, &candle_core::Var)| g.clone().unwrap_or(vec![0.0; v.elem_count()]);
+        let list: Vec<Vec<f32>> = self.list.iter().zip(params.variables()).map(full).collect();
+        Ok(params.all_outward(&list))
+    }
+
+    pub(crate) fn check(&self, params: &Params) -> Result<()> {
+        let fits = |(g, v): (&Option<Vec<f32>>, &candle_core::Var)| {
+            g.as_ref().is_none_or(|g| g.len() == v.elem_count())
+        };
+        if self.list.len() == params.len() && self.list.iter().zip(params.variables()).all(fits) {
+            return Ok(());
+        }
+        Err(Error::OtherParams { what: "gradients", expected: params.len(), found: self.list.len() })
+    }
+}
+
+/// The gradients of `loss` with respect to `params`.
+///
+/// # Shapes
+/// `loss` is a scalar.
+///
+/// # Errors
+/// [`Error::Shape`] when `loss` is no scalar, [`Error::Candle`] when Candle cannot differentiate an operation in between.
+pub fn backward(loss: &Tensor, params: &Params) -> Result<Grads> {
+    let mut all = backward_many(loss, &[params])?;
+    Ok(all.pop().unwrap_or(Grads { list: Vec::new() }))
+}
+
+/// The gradients of `loss` with respect to several networks at once.
+///
+/// # Shapes
+/// `loss` is a scalar.
+///
+/// # Errors
+/// As [`backward`].
+pub fn backward_many(loss: &Tensor, networks: &[&Params]) -> Result<Vec<Grads>> {
+    struct Pop;
+    impl Drop for Pop {
+        fn drop(&mut self) {
+            RUNNING.with_borrow_mut(Vec::pop);
+        }
+    }
+    if loss.elem_count() != 1 {
+        return Err(Error::Shape { what: "loss", expected: "()".into(), found: loss.dims().to_vec() });
+    }
+    RUNNING.with_borrow_mut(|r| r.push(HashMap::new()));
+    let pop = Pop;
+    let store = loss.backward()?;
+    let mut found = RUNNING.with_borrow_mut(|r| r.last_mut().map(std::mem::take)).unwrap_or_default();
+    drop(pop);
+    let mut out = Vec::with_capacity(networks.len());
+    for params in networks {
+        let mut list = Vec::with_capacity(params.len());
+        for var in params.variables() {
+            let mut g = found.remove(&var.as_tensor().id());
+            // A variable used through Candle's own operations has its gradient there.
+            if let Some(t) = store.get(var.as_tensor()) {
+                let more = with(&t.contiguous()?, <[f32]>::to_vec)?;
+                match &mut g {
+                    Some(g) => add_assign(g, &more),
+                    None => g = Some(more),
+                }
+            }
+            list.push(g);
+        }
+        out.push(Grads { list });
+    }
+    Ok(out)
+}

@@ -1,0 +1,183 @@
+//! Max pooling and the spatial softmax.
+
+use super::act::exp;
+use super::{each, fma, scratch, simd, worthwhile};
+use rayon::prelude::*;
+
+/// Window of the pooling, its step and its border.
+const K: usize = 3;
+const STEP: usize = 2;
+const PAD: usize = 1;
+
+/// Sizes of a map `(b, h, w, c)`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Map {
+    pub(crate) b: usize,
+    pub(crate) h: usize,
+    pub(crate) w: usize,
+    pub(crate) c: usize,
+}
+
+impl Map {
+    /// The map after pooling.
+    pub(crate) fn pooled(&self) -> Self {
+        let half = |n: usize| (n + 2 * PAD).saturating_sub(K) / STEP + 1;
+        Self { h: half(self.h), w: half(self.w), ..*self }
+    }
+    fn size(&self) -> usize {
+        self.h * self.w * self.c
+    }
+}
+
+/// The input position under tap (ky, kx) of output (oy, ox), if inside.
+#[inline(always)]
+fn under(m: &Map, oy: usize, ox: usize, tap: usize) -> Option<usize> {
+    let y = (oy * STEP + tap / K).checked_sub(PAD).filter(|y| *y < m.h)?;
+    let x = (ox * STEP + tap % K).checked_sub(PAD).filter(|x| *x < m.w)?;
+    Some((y * m.w + x) * m.c)
+}
+
+simd! {
+fn max_sample(x: &[f32], y: &mut [f32], at: &mut [u8], m: &Map) {
+    let _ = FMA;
+    let (p, c) = (m.pooled(), m.c);
+    for (o, (y, at)) in y.chunks_exact_mut(c).zip(at.chunks_exact_mut(c)).enumerate() {
+        y.fill(f32::NEG_INFINITY);
+        at.fill(0);
+        for tap in 0..K * K {
+            let Some(s) = under(m, o / p.w, o % p.w, tap) else { continue };
+            let x = &x[s..s + c];
+            for i in 0..c {
+                let more = x[i] > y[i] || x[i].is_nan();
+                y[i] = if more { x[i] } else { y[i] };
+                at[i] = if more { tap as u8 } else { at[i] };
+            }
+        }
+    }
+}
+}
+simd! {
+fn max_sample_back(dy: &[f32], at: &[u8], dx: &mut [f32], m: &Map) {
+    let _ = FMA;
+    let (p, c) = (m.pooled(), m.c);
+    dx.fill(0.0);
+    for (o, (dy, at)) in dy.chunks_exact(c).zip(at.chunks_exact(c)).enumerate() {
+        for tap in 0..K * K {
+            let Some(s) = under(m, o / p.w, o % p.w, tap) else { continue };
+            let dx = &mut dx[s..s + c];
+            for i in 0..c {
+                dx[i] += if at[i] == tap as u8 { dy[i] } else { 0.0 };
+            }
+        }
+    }
+}
+}
+
+/// The largest of every 3x3 window, step 2, border 1, and the tap it came from. Of equal ones the first counts.
+pub(crate) fn max_forward(x: &[f32], m: &Map) -> (Vec<f32>, Vec<u8>) {
+    let size = m.pooled().size();
+    let mut y = scratch(m.b * size);
+    let mut at = vec![0; m.b * size];
+    let one = |i: usize, y: &mut [f32], at: &mut [u8]| max_sample(&x[i * m.size()..][..m.size()], y, at, m);
+    if m.b > 1 && worthwhile(x.len()) {
+        y.par_chunks_mut(size)
+            .zip(at.par_chunks_mut(size))
+            .enumerate()
+            .for_each(|(i, (y, at))| one(i, y, at));
+    } else {
+        y.chunks_mut(size).zip(at.chunks_mut(size)).enumerate().for_each(|(i, (y, at))| one(i, y, at));
+    }
+    (y, at)
+}
+
+pub(crate) fn max_backward(dy: &[f32], at: &[u8], m: &Map) -> Vec<f32> {
+    let size = m.pooled().size();
+    let mut dx = scratch(m.b * m.size());
+    each(&mut dx, m.size(), |i, dx| max_sample_back(&dy[i * size..][..size], &at[i * size..][..size], dx, m));
+    dx
+}
+
+/// -1, ..., 1 in `n` equal steps; -1 alone.
+pub(crate) fn position(i: usize, n: usize) -> f32 {
+    if n < 2 { -1.0 } else { (2.0 * i as f64 / (n - 1) as f64 - 1.0) as f32 }
+}
+
+simd! {
+/// Turns the logits `(h, w, c)` of one sample into attention, and sets `out` to the pairs (x, y). `t` is scratch of 4c.
+fn attend(a: &mut [f32], out: &mut [f32], m: &Map, t: &mut [f32]) {
+    let c = m.c;
+    let (top, rest) = t.split_at_mut(c);
+    let (sum, rest) = rest.split_at_mut(c);
+    let (ex, ey) = rest.split_at_mut(c);
+    top.fill(f32::NEG_INFINITY);
+    for r in a.chunks_exact(c) {
+        for i in 0..c {
+            top[i] = if r[i] > top[i] { r[i] } else { top[i] };
+        }
+    }
+    sum.fill(0.0);
+    ex.fill(0.0);
+    ey.fill(0.0);
+    for (p, r) in a.chunks_exact_mut(c).enumerate() {
+        let (x, y) = (position(p % m.w, m.w), position(p / m.w, m.h));
+        for i in 0..c {
+            let e = exp::<FMA>(r[i] - top[i]);
+            r[i] = e;
+            sum[i] += e;
+            ex[i] = fma::<FMA>(e, x, ex[i]);
+            ey[i] = fma::<FMA>(e, y, ey[i]);
+        }
+    }
+    for i in 0..c {
+        sum[i] = 1.0 / sum[i];
+        out[2 * i] = ex[i] * sum[i];
+        out[2 * i + 1] = ey[i] * sum[i];
+    }
+    for r in a.chunks_exact_mut(c) {
+        for i in 0..c {
+            r[i] *= sum[i];
+        }
+    }
+}
+}
+simd! {
+/// The gradient of the logits: attention times the gradient of the pair times the distance from the pair.
+fn attend_back(a: &[f32], out: &[f32], d: &[f32], dx: &mut [f32], m: &Map) {
+    let _ = FMA;
+    let c = m.c;
+    for (p, (a, dx)) in a.chunks_exact(c).zip(dx.chunks_exact_mut(c)).enumerate() {
+        let (x, y) = (position(p % m.w, m.w), position(p / m.w, m.h));
+        for i in 0..c {
+            dx[i] = a[i] * (d[2 * i] * (x - out[2 * i]) + d[2 * i + 1] * (y - out[2 * i + 1]));
+        }
+    }
+}
+}
+
+/// `(b, h, w, c)` logits to `(b, c, 2)` expected positions, and the attention.
+pub(crate) fn keypoints_forward(logits: &[f32], m: &Map) -> (Vec<f32>, Vec<f32>) {
+    let mut a = scratch(logits.len());
+    let mut out = scratch(m.b * m.c * 2);
+    let one = |i: usize, a: &mut [f32], o: &mut [f32]| {
+        a.copy_from_slice(&logits[i * m.size()..][..m.size()]);
+        attend(a, o, m, &mut vec![0.0; 4 * m.c]);
+    };
+    if m.b > 1 && worthwhile(logits.len()) {
+        a.par_chunks_mut(m.size())
+            .zip(out.par_chunks_mut(m.c * 2))
+            .enumerate()
+            .for_each(|(i, (a, o))| one(i, a, o));
+    } else {
+        a.chunks_mut(m.size()).zip(out.chunks_mut(m.c * 2)).enumerate().for_each(|(i, (a, o))| one(i, a, o));
+    }
+    (out, a)
+}
+
+pub(crate) fn keypoints_backward(a: &[f32], out: &[f32], d: &[f32], m: &Map) -> Vec<f32> {
+    let mut dx = scratch(a.len());
+    let (size, pair) = (m.size(), m.c * 2);
+    each(&mut dx, size, |i, dx| {
+        attend_back(&a[i * size..][..size], &out[i * pair..][..pair], &d[i * pair..][..pair], dx, m);
+    });
+    dx
+}

@@ -1,0 +1,122 @@
+use crate::kernel::optim;
+use crate::params::{Params, with};
+use crate::weights::{HostTensor, Weights};
+use crate::{Error, Result};
+
+/// Settings of [`Ema`].
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EmaConfig {
+    /// Exponent of the warm-up; larger forgets the first weights later.
+    pub power: f32,
+    /// Largest decay.
+    pub max: f32,
+}
+
+impl Default for EmaConfig {
+    fn default() -> Self {
+        Self { power: 0.75, max: 0.9999 }
+    }
+}
+
+impl EmaConfig {
+    /// The share of the old average that update number `step` (from 0) keeps: 1 - (1 + step)^-power, between 0 and `max`.
+    ///
+    /// # Source
+    /// `EMAModel.get_decay` of Diffusion Policy, also `diffusers.training_utils`, with `inv_gamma` 1.
+    #[must_use]
+    pub fn decay(&self, step: u64) -> f64 {
+        (1.0 - (1.0 + step as f64).powf(-f64::from(self.power))).min(f64::from(self.max)).max(0.0)
+    }
+}
+
+/// An average of the weights over training, which acts better than the last ones.
+#[derive(Clone, Debug)]
+pub struct Ema {
+    config: EmaConfig,
+    params: Params,
+    average: Vec<Vec<f32>>,
+    updates: u64,
+}
+
+/// Updates are stored as two numbers that `f32` holds exactly.
+const UPDATE_BASE: u64 = 1 << 20;
+
+impl Ema {
+    /// An average that starts at the present weights.
+    ///
+    /// # Errors
+    /// [`Error::Candle`] when a variable cannot be read.
+    pub fn new(config: &EmaConfig, params: &Params) -> Result<Self> {
+        let average: Result<_> = params.variables().map(|v| with(v.as_tensor(), <[f32]>::to_vec)).collect();
+        Ok(Self { config: *config, params: params.clone(), average: average?, updates: 0 })
+    }
+
+    /// Moves the average towards the present weights; the first update takes them over.
+    ///
+    /// # Errors
+    /// [`Error::OtherParams`] when `params` are of another network.
+    pub fn update(&mut self, params: &Params) -> Result<()> {
+        let same = params.len() == self.average.len()
+            && params.variables().zip(&self.average).all(|(v, a)| v.elem_count() == a.len());
+        if !same {
+            let (expected, found) = (params.len(), self.average.len());
+            return Err(Error::OtherParams { what: "moving average", expected, found });
+        }
+        let part = (1.0 - self.config.decay(self.updates)) as f32;
+        for (var, a) in params.variables().zip(&mut self.average) {
+            with(var.as_tensor(), |p| if part < 1.0 { optim::blend(a, p, part) } else { a.copy_from_slice(p) })?;
+        }
+        self.updates += 1;
+        Ok(())
+    }
+
+    /// The averaged weights in PyTorch's layout.
+    ///
+    /// # Errors
+    /// None at present; other devices will have to copy.
+    pub fn weights(&self) -> Result<Weights> {
+        Ok(self.params.all_outward(&self.average))
+    }
+
+    /// How many updates were made.
+    #[must_use]
+    pub fn updates(&self) -> u64 {
+        self.updates
+    }
+
+    /// The averages as `average.<name>` in PyTorch's layout, and `updates`.
+    ///
+    /// # Errors
+    /// As [`Ema::weights`].
+    pub fn state(&self) -> Result<Weights> {
+        let mut out: Weights = self.weights()?.into_iter().map(|(n, t)| (format!("average.{n}"), t)).collect();
+        let data = vec![(self.updates / UPDATE_BASE) as f32, (self.updates % UPDATE_BASE) as f32];
+        out.insert("updates".into(), HostTensor { shape: vec![2], data });
+        Ok(out)
+    }
+
+    /// Takes over a [`Ema::state`], all or nothing.
+    ///
+    /// # Errors
+    /// [`Error::Import`] when names or shapes differ.
+    pub fn load_state(&mut self, state: &Weights) -> Result<()> {
+        let (mut average, mut updates, mut unexpected) = (Weights::new(), None, Vec::new());
+        for (name, t) in state {
+            if let Some(n) = name.strip_prefix("average.") {
+                average.insert(n.into(), t.clone());
+            } else if let ("updates", [high, low]) = (name.as_str(), &t.data[..]) {
+                updates = Some(*high as u64 * UPDATE_BASE + *low as u64);
+            } else {
+                unexpected.push(name.clone());
+            }
+        }
+        let missing = if updates.is_none() { vec!["updates".to_owned()] } else { Vec::new() };
+        if !unexpected.is_empty() || !missing.is_empty() {
+            return Err(Error::Import { missing, unexpected, misshaped: Vec::new() });
+        }
+        self.average = self.params.all_inward(&average)?;
+        self.updates = updates.unwrap_or_default();
+        Ok(())
+    }
+}

@@ -1,0 +1,296 @@
+use crate::weights::{HostTensor, Weights};
+use crate::{Error, Result};
+use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Storage, Tensor, Var};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+use std::cell::{Cell, RefCell};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// What a network is built for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Weights are variables: a forward pass keeps what [`crate::backward`] needs.
+    Train,
+    /// Weights are plain tensors that share storage with the variables: nothing is kept.
+    Infer,
+}
+
+/// How a weight's axes lie here: `order[j]` is the PyTorch axis that is our axis j. `None` keeps PyTorch's.
+pub(crate) type Order = Option<&'static [usize]>;
+
+/// A weight as a layer holds it.
+#[derive(Clone, Debug)]
+pub(crate) struct Weight {
+    pub(crate) tensor: Tensor,
+    pub(crate) train: bool,
+}
+
+/// How a parameter starts.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Init {
+    /// Uniform in plus or minus this.
+    Uniform(f32),
+    Ones,
+    Zeros,
+}
+
+struct Param {
+    var: Var,
+    /// PyTorch's shape.
+    shape: Vec<usize>,
+    order: Order,
+}
+
+struct Shared {
+    mode: Mode,
+    rng: RefCell<ChaCha8Rng>,
+    params: RefCell<BTreeMap<String, Param>>,
+    duplicate: Cell<Option<String>>,
+}
+
+/// Collects the parameters of layers while they are built; a path, like `VarBuilder`.
+#[derive(Clone)]
+pub struct Builder<'a> {
+    shared: &'a Shared,
+    path: String,
+}
+
+impl Builder<'_> {
+    /// The builder for a part of the network called `name`.
+    #[must_use]
+    pub fn pp(&self, name: impl std::fmt::Display) -> Self {
+        let dot = if self.path.is_empty() { "" } else { "." };
+        Self { shared: self.shared, path: format!("{}{dot}{name}", self.path) }
+    }
+
+    /// The dotted path so far.
+    #[must_use]
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// Adds a parameter of PyTorch shape `shape`.
+    pub(crate) fn weight(&self, name: &str, shape: &[usize], order: Order, init: Init) -> Result<Weight> {
+        let name = self.pp(name).path;
+        let n = shape.iter().product();
+        let data: Vec<f32> = match init {
+            Init::Uniform(b) => {
+                let mut rng = self.shared.rng.borrow_mut();
+                (0..n).map(|_| (2.0 * rng.random::<f32>() - 1.0) * b).collect()
+            }
+            Init::Ones => vec![1.0; n],
+            Init::Zeros => vec![0.0; n],
+        };
+        let inner: Vec<usize> = order.map_or(shape.to_vec(), |o| o.iter().map(|a| shape[*a]).collect());
+        let var = Var::from_vec(data, inner, &Device::Cpu)?;
+        let train = self.shared.mode == Mode::Train;
+        let tensor = if train { var.as_tensor().clone() } else { var.as_detached_tensor() };
+        let param = Param { var, shape: shape.to_vec(), order };
+        if self.shared.params.borrow_mut().insert(name.clone(), param).is_some() {
+            self.shared.duplicate.set(Some(name));
+        }
+        Ok(Weight { tensor, train })
+    }
+}
+
+/// The parameters of a network, by name.
+///
+/// Clones share the numbers.
+#[derive(Clone)]
+pub struct Params {
+    params: Arc<BTreeMap<String, Param>>,
+}
+
+impl std::fmt::Debug for Params {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_map().entries(self.params.iter().map(|(n, p)| (n, &p.shape))).finish()
+    }
+}
+
+impl Params {
+    /// Builds a network with `f` and returns its parameters beside it.
+    ///
+    /// They start as in PyTorch: weights and biases of linear and convolution layers uniform in plus or minus
+    /// 1 / sqrt(fan in), gains of norms 1, their biases 0, drawn from `rng` in the order of building.
+    ///
+    /// # Errors
+    /// What `f` returns, and [`Error::Duplicate`] when two parameters have one name.
+    pub fn build<T>(
+        mode: Mode,
+        rng: &mut ChaCha8Rng,
+        f: impl FnOnce(&Builder<'_>) -> Result<T>,
+    ) -> Result<(Self, T)> {
+        let shared =
+            Shared { mode, rng: RefCell::new(rng.clone()), params: RefCell::default(), duplicate: Cell::default() };
+        let built = f(&Builder { shared: &shared, path: String::new() })?;
+        *rng = shared.rng.into_inner();
+        if let Some(name) = shared.duplicate.take() {
+            return Err(Error::Duplicate(name));
+        }
+        Ok((Self { params: Arc::new(shared.params.into_inner()) }, built))
+    }
+
+    /// All parameters in PyTorch's layout.
+    ///
+    /// # Errors
+    /// [`Error::Candle`] when a variable cannot be read.
+    pub fn export(&self) -> Result<Weights> {
+        let mut out = Weights::new();
+        for (name, p) in self.params.iter() {
+            let data = with(p.var.as_tensor(), |d| permute(d, &p.shape, p.order, false))?;
+            out.insert(name.clone(), HostTensor { shape: p.shape.clone(), data });
+        }
+        Ok(out)
+    }
+
+    /// Takes over `weights`, all or nothing.
+    ///
+    /// # Errors
+    /// [`Error::Import`] lists every missing, unexpected and mis-shaped tensor; the parameters are then as before.
+    pub fn import(&self, weights: &Weights) -> Result<()> {
+        self.matches(weights)?;
+        for (param, tensor) in self.params.values().zip(weights.values()) {
+            let data = inward(&tensor.data, &param.shape, param.order);
+            edit(&param.var, |p| p.copy_from_slice(&data))?;
+        }
+        Ok(())
+    }
+
+    /// How many numbers the parameters hold.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.params.values().map(|p| p.var.elem_count()).sum()
+    }
+
+    /// How many parameters there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.params.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.params.is_empty()
+    }
+
+    /// The names, sorted.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.params.keys().map(String::as_str)
+    }
+
+    /// Fails with the list of differences unless `weights` has these names and shapes.
+    pub(crate) fn matches(&self, weights: &Weights) -> Result<()> {
+        let missing: Vec<String> = self.params.keys().filter(|n| !weights.contains_key(*n)).cloned().collect();
+        let unexpected: Vec<String> = weights.keys().filter(|n| !self.params.contains_key(*n)).cloned().collect();
+        let fits = |p: &Param, t: &HostTensor| p.shape == t.shape && t.data.len() == p.var.elem_count();
+        let misshaped: Vec<String> = self
+            .params
+            .iter()
+            .filter_map(|(n, p)| weights.get(n).filter(|t| !fits(p, t)).map(|t| (n, p, t)))
+            .map(|(n, p, t)| format!("{n}: expected {:?}, found {:?} with {} numbers", p.shape, t.shape, t.data.len()))
+            .collect();
+        if missing.is_empty() && unexpected.is_empty() && misshaped.is_empty() {
+            return Ok(());
+        }
+        Err(Error::Import { missing, unexpected, misshaped })
+    }
+
+    pub(crate) fn variables(&self) -> impl Iterator<Item = &Var> {
+        self.params.values().map(|p| &p.var)
+    }
+
+    /// All of `list`, one entry per parameter in our layout, by name in PyTorch's.
+    pub(crate) fn all_outward(&self, list: &[Vec<f32>]) -> Weights {
+        self.params
+            .iter()
+            .zip(list)
+            .map(|((n, p), d)| {
+                (n.clone(), HostTensor { shape: p.shape.clone(), data: permute(d, &p.shape, p.order, false) })
+            })
+            .collect()
+    }
+
+    /// The inverse of [`Params::all_outward`].
+    pub(crate) fn all_inward(&self, weights: &Weights) -> Result<Vec<Vec<f32>>> {
+        self.matches(weights)?;
+        let each = self.params.values().zip(weights.values());
+        Ok(each.map(|(p, t)| inward(&t.data, &p.shape, p.order)).collect())
+    }
+}
+
+fn inward(data: &[f32], shape: &[usize], order: Order) -> Vec<f32> {
+    permute(data, shape, order, true)
+}
+
+/// Copies between PyTorch's layout `shape` and ours, in the direction asked for.
+fn permute(data: &[f32], shape: &[usize], order: Order, inward: bool) -> Vec<f32> {
+    let Some(order) = order else { return data.to_vec() };
+    let mut strides = vec![1; shape.len()];
+    for i in (1..shape.len()).rev() {
+        strides[i - 1] = strides[i] * shape[i];
+    }
+    let dims: Vec<(usize, usize)> = order.iter().map(|a| (shape[*a], strides[*a])).collect();
+    let mut out = vec![0.0; data.len()];
+    let mut index = vec![0; dims.len()];
+    let mut theirs = 0;
+    for ours in 0..data.len() {
+        if inward {
+            out[ours] = data[theirs];
+        } else {
+            out[theirs] = data[ours];
+        }
+        for (i, (size, stride)) in dims.iter().enumerate().rev() {
+            index[i] += 1;
+            theirs += stride;
+            if index[i] < *size {
+                break;
+            }
+            theirs -= size * stride;
+            index[i] = 0;
+        }
+    }
+    out
+}
+
+/// The numbers of a contiguous host tensor of `f32`.
+pub(crate) fn slice<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
+    match (storage, layout.contiguous_offsets()) {
+        (Storage::Cpu(CpuStorage::F32(v)), Some((a, b))) => Ok(&v[a..b]),
+        _ => Err(Error::Config {
+            what: "tensor",
+            expected: "contiguous f32 on the CPU",
+            found: format!("{:?} of {layout:?}", storage.dtype()),
+        }),
+    }
+}
+
+/// Runs `f` on the numbers of a contiguous tensor.
+pub(crate) fn with<R>(tensor: &Tensor, f: impl FnOnce(&[f32]) -> R) -> Result<R> {
+    let (storage, layout) = tensor.storage_and_layout();
+    Ok(f(slice(&storage, layout)?))
+}
+
+struct Edit<F>(RefCell<Option<F>>);
+
+impl<F: FnOnce(&mut [f32])> InplaceOp1 for Edit<F> {
+    fn name(&self) -> &'static str {
+        "edit"
+    }
+
+    fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
+        let (CpuStorage::F32(v), Some((a, b))) = (storage, layout.contiguous_offsets()) else {
+            candle_core::bail!("expected a contiguous variable of f32");
+        };
+        if let Some(f) = self.0.take() {
+            f(&mut v[a..b]);
+        }
+        Ok(())
+    }
+}
+
+/// Changes a variable in place.
+pub(crate) fn edit(var: &Var, f: impl FnOnce(&mut [f32])) -> Result<()> {
+    Ok(var.as_tensor().inplace_op1(&Edit(RefCell::new(Some(f))))?)
+}

@@ -1,0 +1,195 @@
+use crate::layers::{Act, Conv2d, Extra, GroupNorm, Linear, MaxPool2d, SpatialSoftmax, relu};
+use crate::params::Builder;
+use crate::tape::{Node, Tape, run};
+use crate::{Error, Result};
+use candle_core::Tensor;
+
+/// Channels of one group of the normalisations.
+const GROUP: usize = 16;
+
+/// Sizes of an [`RgbEncoder`].
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RgbEncoderConfig {
+    /// Rows of an image, pixels.
+    pub height: usize,
+    /// Columns of an image, pixels.
+    pub width: usize,
+    /// Channels of the first stage, a multiple of 16. ResNet-18: 64.
+    pub base_width: usize,
+    /// Residual blocks of each stage; every stage after the first halves the map and doubles the channels. ResNet-18:
+    /// [2, 2, 2, 2]. Fewer stages keep a finer map for small images.
+    pub stage_blocks: Vec<usize>,
+    /// Keypoints of the spatial softmax. LeRobot: 32.
+    pub keypoints: usize,
+    /// Numbers that come out. LeRobot: twice the keypoints.
+    pub feature_dim: usize,
+}
+
+impl RgbEncoderConfig {
+    /// # Errors
+    /// [`Error::Config`] names the first setting that does not work.
+    pub fn validate(&self) -> Result<()> {
+        let fail = |what, expected, found: String| Err(Error::Config { what, expected, found });
+        if self.base_width == 0 || !self.base_width.is_multiple_of(GROUP) {
+            return fail("base_width", "a positive multiple of 16", self.base_width.to_string());
+        }
+        if self.stage_blocks.is_empty() || self.stage_blocks.contains(&0) {
+            return fail("stage_blocks", "at least one stage of at least one block", format!("{:?}", self.stage_blocks));
+        }
+        if self.keypoints == 0 || self.feature_dim == 0 {
+            let found = format!("{} and {}", self.keypoints, self.feature_dim);
+            return fail("keypoints and feature_dim", "positive numbers", found);
+        }
+        if self.height == 0 || self.width == 0 {
+            return fail("height and width", "positive numbers", format!("{} and {}", self.height, self.width));
+        }
+        Ok(())
+    }
+
+    /// Rows and columns of the map that the spatial softmax sees.
+    #[must_use]
+    pub fn map_size(&self) -> (usize, usize) {
+        // The stem halves twice; every halving rounds up.
+        let halvings = self.stage_blocks.len() + 1;
+        let small = |n: usize| (0..halvings).fold(n, |n, _| n.div_ceil(2));
+        (small(self.height), small(self.width))
+    }
+}
+
+/// Two 3x3 convolutions and a residual connection.
+#[derive(Clone, Debug)]
+struct BasicBlock {
+    conv1: Conv2d,
+    norm1: GroupNorm,
+    conv2: Conv2d,
+    norm2: GroupNorm,
+    shortcut: Option<(Conv2d, GroupNorm)>,
+}
+
+fn norm(channels: usize, act: Act, builder: &Builder<'_>) -> Result<GroupNorm> {
+    GroupNorm::new(channels / GROUP, channels, act, builder)
+}
+
+impl BasicBlock {
+    fn new(from: usize, to: usize, stride: usize, b: &Builder<'_>) -> Result<Self> {
+        let conv1 = Conv2d::new((from, to), 3, stride, 1, false, &b.pp("conv1"))?;
+        let norm1 = norm(to, Act::Relu, &b.pp("bn1"))?;
+        let conv2 = Conv2d::new((to, to), 3, 1, 1, false, &b.pp("conv2"))?;
+        let norm2 = norm(to, Act::Relu, &b.pp("bn2"))?;
+        let shortcut = if stride == 1 && from == to {
+            None
+        } else {
+            let b = b.pp("downsample");
+            let conv = Conv2d::new((from, to), 1, stride, 0, false, &b.pp(0))?;
+            Some((conv, norm(to, Act::None, &b.pp(1))?))
+        };
+        Ok(Self { conv1, norm1, conv2, norm2, shortcut })
+    }
+
+    fn record(&self, tape: &mut Tape, x: Node) -> Result<Node> {
+        let h = self.conv1.record(tape, x)?;
+        let a = self.norm1.record(tape, h, Extra::None)?;
+        tape.done(h);
+        let h = self.conv2.record(tape, a)?;
+        tape.done(a);
+        let residual = match &self.shortcut {
+            None => x,
+            Some((conv, norm)) => {
+                let r = conv.record(tape, x)?;
+                let n = norm.record(tape, r, Extra::None)?;
+                tape.done(r);
+                n
+            }
+        };
+        let y = self.norm2.record(tape, h, Extra::Before(residual))?;
+        tape.done(h);
+        tape.done(residual);
+        Ok(y)
+    }
+}
+
+/// A ResNet with group norm, a spatial softmax and a linear layer: images to features.
+///
+/// Parameters have LeRobot's names below `diffusion.rgb_encoder.`; its buffer `pool.pos_grid` is no parameter here
+/// ([`SpatialSoftmax::position_grid`] makes it).
+///
+/// # Source
+/// `DiffusionRgbEncoder` of LeRobot 0.4.4 (`modeling_diffusion.py`) over torchvision's ResNet-18 with every batch norm
+/// replaced by group norm in groups of 16 channels; Chi et al., "Diffusion Policy", section IV.A.
+#[derive(Clone, Debug)]
+pub struct RgbEncoder {
+    config: RgbEncoderConfig,
+    stem: Conv2d,
+    stem_norm: GroupNorm,
+    blocks: Vec<BasicBlock>,
+    pool: SpatialSoftmax,
+    out: Linear,
+}
+
+impl RgbEncoder {
+    /// # Errors
+    /// As [`RgbEncoderConfig::validate`].
+    pub fn new(config: &RgbEncoderConfig, builder: &Builder<'_>) -> Result<Self> {
+        config.validate()?;
+        let backbone = builder.pp("backbone");
+        let mut width = config.base_width;
+        let stem = Conv2d::new((3, width), 7, 2, 3, false, &backbone.pp(0))?;
+        let stem_norm = norm(width, Act::Relu, &backbone.pp(1))?;
+        let mut blocks = Vec::new();
+        for (stage, count) in config.stage_blocks.iter().enumerate() {
+            // Indices 2 and 3 of torchvision's list are the activation and the pooling.
+            let b = backbone.pp(4 + stage);
+            let to = config.base_width << stage;
+            for i in 0..*count {
+                let stride = if stage > 0 && i == 0 { 2 } else { 1 };
+                blocks.push(BasicBlock::new(width, to, stride, &b.pp(i))?);
+                width = to;
+            }
+        }
+        let pool = SpatialSoftmax::new(width, config.keypoints, &builder.pp("pool"))?;
+        let out = Linear::new(2 * config.keypoints, config.feature_dim, &builder.pp("out"))?;
+        Ok(Self { config: config.clone(), stem, stem_norm, blocks, pool, out })
+    }
+
+    /// The sizes it was built with.
+    #[must_use]
+    pub fn config(&self) -> &RgbEncoderConfig {
+        &self.config
+    }
+
+    /// Features of images. Another size than the configured one works too: the position grid follows the map.
+    ///
+    /// # Shapes
+    /// `(N, H, W, 3)`, channels last, in [0, 1], to `(N, feature_dim)`. The images get no gradient unless Candle tracks
+    /// them.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] when the input is no batch of images.
+    pub fn forward(&self, images: &Tensor) -> Result<Tensor> {
+        match images.dims() {
+            [n, h, w, 3] if n * h * w > 0 => {}
+            found => {
+                let expected = "(N, H, W, 3)".into();
+                return Err(Error::Shape { what: "images", expected, found: found.to_vec() });
+            }
+        }
+        run(&[images], Some(self.stem.anchor()), |tape, n| self.record(tape, n[0]))
+    }
+
+    fn record(&self, tape: &mut Tape, x: Node) -> Result<Node> {
+        let h = self.stem.record(tape, x)?;
+        let a = self.stem_norm.record(tape, h, Extra::None)?;
+        tape.done(h);
+        let mut x = MaxPool2d.record(tape, a)?;
+        tape.done(a);
+        for block in &self.blocks {
+            let y = block.record(tape, x)?;
+            tape.done(x);
+            x = y;
+        }
+        let points = self.pool.record(tape, x)?;
+        let h = self.out.record(tape, points)?;
+        relu(tape, h)
+    }
+}

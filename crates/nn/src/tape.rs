@@ -1,0 +1,322 @@
+//! A record of kernel calls that Candle sees as one operation.
+//!
+//! Candle's own graph allocates zeros and adds for every gradient that flows. Here a whole network is one node: inside it
+//! the first gradient of a value is moved and only further ones are added, and weight gradients go straight to the list
+//! that [`crate::backward`] collects.
+
+use crate::grad;
+use crate::kernel::add_assign;
+use crate::params::{Weight, slice};
+use crate::{Error, Result};
+use candle_core::{
+    CpuStorage, CustomOp1, CustomOp2, CustomOp3, Device, Layout, Shape, StorageRef, Tensor, TensorId,
+};
+use std::ops::Deref;
+use std::sync::Mutex;
+
+/// The number of a value on a tape.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Node(usize);
+
+enum Value {
+    Own(Vec<f32>),
+    Given(Tensor),
+    /// Freed, or handed to Candle.
+    Gone,
+}
+
+struct Slot {
+    value: Value,
+    shape: Vec<usize>,
+    /// Whether a gradient is wanted.
+    grad: bool,
+}
+
+/// A kernel call that can be undone: turns the gradient of its result into those of its inputs and weights.
+pub(crate) trait Step: Send + Sync {
+    fn backward(&self, values: &Values<'_>, dy: Vec<f32>, flow: &mut Flow) -> Result<()>;
+}
+
+/// Values and the steps that made them.
+pub(crate) struct Tape {
+    slots: Vec<Slot>,
+    steps: Vec<(Node, Box<dyn Step>)>,
+    record: bool,
+}
+
+/// The numbers of a value, wherever they live.
+pub(crate) enum Read<'a> {
+    Own(&'a [f32]),
+    Given(StorageRef<'a>, &'a Layout),
+}
+
+impl Deref for Read<'_> {
+    type Target = [f32];
+    fn deref(&self) -> &[f32] {
+        match self {
+            Read::Own(v) => v,
+            // Checked when the value was put on the tape.
+            Read::Given(s, l) => slice(s, l).unwrap_or_default(),
+        }
+    }
+}
+
+/// Opens a contiguous tensor for reading.
+pub(crate) fn read(tensor: &Tensor) -> Result<Read<'_>> {
+    let (storage, layout) = tensor.storage_and_layout();
+    slice(&storage, layout)?;
+    Ok(Read::Given(storage, layout))
+}
+
+impl Tape {
+    pub(crate) fn shape(&self, n: Node) -> &[usize] {
+        &self.slots[n.0].shape
+    }
+
+    /// Whether a gradient of `n` is wanted.
+    pub(crate) fn grad(&self, n: Node) -> bool {
+        self.slots[n.0].grad
+    }
+
+    pub(crate) fn read(&self, n: Node) -> Result<Read<'_>> {
+        match &self.slots[n.0].value {
+            Value::Own(v) => Ok(Read::Own(v)),
+            Value::Given(t) => read(t),
+            Value::Gone => Err(Error::NotRecording),
+        }
+    }
+
+    /// Adds a result. `step` is kept if something needs its gradient.
+    pub(crate) fn push<S: Step + 'static>(
+        &mut self,
+        value: Vec<f32>,
+        shape: impl Into<Vec<usize>>,
+        inputs: &[Node],
+        weights: &[&Weight],
+        step: S,
+    ) -> Node {
+        let grad = self.record && (inputs.iter().any(|n| self.grad(*n)) || weights.iter().any(|w| w.train));
+        let node = Node(self.slots.len());
+        self.slots.push(Slot { value: Value::Own(value), shape: shape.into(), grad });
+        if grad {
+            self.steps.push((node, Box::new(step)));
+        }
+        node
+    }
+
+    /// The node that the next [`Tape::push`] will return.
+    pub(crate) fn next(&self) -> Node {
+        Node(self.slots.len())
+    }
+
+    /// Says that a value is not read again in the forward pass: without a record its memory is freed.
+    pub(crate) fn done(&mut self, n: Node) {
+        if !self.record && matches!(self.slots[n.0].value, Value::Own(_)) {
+            self.slots[n.0].value = Value::Gone;
+        }
+    }
+}
+
+/// The values of a finished tape, its result among them.
+pub(crate) struct Values<'a> {
+    tape: &'a Tape,
+    out: Node,
+    result: &'a Tensor,
+}
+
+impl Values<'_> {
+    pub(crate) fn read(&self, n: Node) -> Result<Read<'_>> {
+        if n == self.out { read(self.result) } else { self.tape.read(n) }
+    }
+    pub(crate) fn grad(&self, n: Node) -> bool {
+        self.tape.grad(n)
+    }
+}
+
+/// Gradients on their way back.
+pub(crate) struct Flow {
+    grads: Vec<Option<Vec<f32>>>,
+    pub(crate) weights: Vec<(TensorId, Vec<f32>)>,
+}
+
+impl Flow {
+    /// A part of the gradient of `n`.
+    pub(crate) fn add(&mut self, n: Node, g: Vec<f32>) {
+        match &mut self.grads[n.0] {
+            Some(sum) => add_assign(sum, &g),
+            empty => *empty = Some(g),
+        }
+    }
+    /// A part of the gradient of a weight.
+    pub(crate) fn weight(&mut self, w: &Weight, g: Vec<f32>) {
+        if w.train {
+            self.weights.push((w.tensor.id(), g));
+        }
+    }
+}
+
+/// A finished tape as an operation of Candle's.
+struct Whole {
+    tape: Tape,
+    out: Node,
+    /// The result, until Candle takes it.
+    value: Mutex<Option<Vec<f32>>>,
+    /// The inputs that Candle tracks, in the order of its arguments.
+    tracked: Vec<Node>,
+}
+
+impl Whole {
+    fn take(&self) -> candle_core::Result<(CpuStorage, Shape)> {
+        let taken = self.value.lock().ok().and_then(|mut v| v.take());
+        let Some(v) = taken else { candle_core::bail!("the result was taken before") };
+        Ok((CpuStorage::F32(v), Shape::from(self.tape.shape(self.out).to_vec())))
+    }
+
+    fn back(&self, result: &Tensor, dy: &Tensor) -> candle_core::Result<[Option<Tensor>; 3]> {
+        let dy = dy.contiguous()?;
+        let flow = in_pool(|| self.flow(result, &dy)).map_err(candle_core::Error::wrap)?;
+        grad::give(flow.weights).map_err(candle_core::Error::wrap)?;
+        let mut grads = flow.grads;
+        let mut out = [None, None, None];
+        for (o, n) in out.iter_mut().zip(&self.tracked) {
+            if let Some(g) = grads[n.0].take() {
+                *o = Some(Tensor::from_vec(g, self.tape.shape(*n), &Device::Cpu)?);
+            }
+        }
+        Ok(out)
+    }
+
+    fn flow(&self, result: &Tensor, dy: &Tensor) -> Result<Flow> {
+        let values = Values { tape: &self.tape, out: self.out, result };
+        let mut flow = Flow { grads: self.tape.slots.iter().map(|_| None).collect(), weights: Vec::new() };
+        flow.add(self.out, read(dy)?.to_vec());
+        for (node, step) in self.tape.steps.iter().rev() {
+            // A value that nothing read has no gradient.
+            if let Some(dy) = flow.grads[node.0].take() {
+                step.backward(&values, dy, &mut flow)?;
+            }
+        }
+        Ok(flow)
+    }
+}
+
+impl CustomOp1 for Whole {
+    fn name(&self) -> &'static str {
+        "network"
+    }
+    fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> candle_core::Result<(CpuStorage, Shape)> {
+        self.take()
+    }
+    fn bwd(&self, _: &Tensor, y: &Tensor, dy: &Tensor) -> candle_core::Result<Option<Tensor>> {
+        let [a, _, _] = self.back(y, dy)?;
+        Ok(a)
+    }
+}
+
+impl CustomOp2 for Whole {
+    fn name(&self) -> &'static str {
+        "network"
+    }
+    fn cpu_fwd(
+        &self,
+        _: &CpuStorage,
+        _: &Layout,
+        _: &CpuStorage,
+        _: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        self.take()
+    }
+    fn bwd(
+        &self,
+        _: &Tensor,
+        _: &Tensor,
+        y: &Tensor,
+        dy: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>)> {
+        let [a, b, _] = self.back(y, dy)?;
+        Ok((a, b))
+    }
+}
+
+impl CustomOp3 for Whole {
+    fn name(&self) -> &'static str {
+        "network"
+    }
+    fn cpu_fwd(
+        &self,
+        _: &CpuStorage,
+        _: &Layout,
+        _: &CpuStorage,
+        _: &Layout,
+        _: &CpuStorage,
+        _: &Layout,
+    ) -> candle_core::Result<(CpuStorage, Shape)> {
+        self.take()
+    }
+    fn bwd(
+        &self,
+        _: &Tensor,
+        _: &Tensor,
+        _: &Tensor,
+        y: &Tensor,
+        dy: &Tensor,
+    ) -> candle_core::Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
+        let [a, b, c] = self.back(y, dy)?;
+        Ok((a, b, c))
+    }
+}
+
+/// Runs `f` on a thread of the pool: from outside it every parallel loop would be handed over and waited for.
+fn in_pool<R: Send>(f: impl FnOnce() -> R + Send) -> R {
+    if rayon::current_thread_index().is_some() || rayon::current_num_threads() == 1 {
+        return f();
+    }
+    rayon::scope(|_| f())
+}
+
+/// Runs `f` on a new tape with `inputs` (at most three) and returns its result as a tensor. `weight` is any weight that
+/// `f` uses: it says whether there is something to train, and ties the result to Candle's graph.
+pub(crate) fn run(
+    inputs: &[&Tensor],
+    weight: Option<&Weight>,
+    f: impl FnOnce(&mut Tape, &[Node]) -> Result<Node> + Send,
+) -> Result<Tensor> {
+    let anchor = weight.filter(|w| w.train).map(|w| &w.tensor);
+    let record = grad::enabled() && (anchor.is_some() || inputs.iter().any(|t| t.track_op()));
+    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record };
+    let mut nodes = Vec::with_capacity(inputs.len());
+    let (mut arguments, mut tracked) = (Vec::new(), Vec::new());
+    for input in inputs {
+        let tensor = input.contiguous()?;
+        drop(read(&tensor)?);
+        let (node, grad) = (Node(tape.slots.len()), record && input.track_op());
+        // Detached, or the tape would keep alive the graph before it.
+        let value = Value::Given(tensor.detach());
+        tape.slots.push(Slot { value, shape: input.dims().to_vec(), grad });
+        nodes.push(node);
+        if grad {
+            arguments.push(*input);
+            tracked.push(node);
+        }
+    }
+    let out = in_pool(|| f(&mut tape, &nodes))?;
+    let shape = tape.shape(out).to_vec();
+    let value = match std::mem::replace(&mut tape.slots[out.0].value, Value::Gone) {
+        Value::Own(v) => v,
+        // A layer that returns an input unchanged.
+        _ => return Ok(inputs.get(out.0).ok_or(Error::NotRecording)?.copy()?),
+    };
+    if !record {
+        return Ok(Tensor::from_vec(value, shape, &Device::Cpu)?);
+    }
+    if arguments.is_empty() {
+        arguments.extend(anchor);
+    }
+    let whole = Whole { tape, out, value: Mutex::new(Some(value)), tracked };
+    Ok(match arguments[..] {
+        [a] => a.apply_op1(whole)?,
+        [a, b] => a.apply_op2(b, whole)?,
+        [a, b, c] => a.apply_op3(b, c, whole)?,
+        _ => return Err(Error::NotRecording),
+    })
+}

@@ -47,3 +47,30 @@ fn room(height: usize, width: usize, size: usize) -> Result<(usize, usize)> {
         _ => Err(Error::Crop { height, width, size }),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use e2h_core::stream;
+
+    #[test]
+    fn random_crops_reach_every_place_and_leave_the_image_nowhere() {
+        let mut rng = stream(1, "crop", 0, 0);
+        let mut seen = std::collections::BTreeSet::new();
+        for _ in 0..500 {
+            let crop = Crop::random(6, 5, 4, &mut rng).unwrap();
+            assert!(crop.top + 4 <= 6 && crop.left + 4 <= 5);
+            seen.insert((crop.top, crop.left));
+        }
+        assert_eq!(seen.len(), 3 * 2);
+    }
+
+    #[test]
+    fn rows_are_byte_ranges_of_the_image() {
+        let crop = Crop::centre(4, 6, 2).unwrap();
+        assert_eq!(crop, Crop { top: 1, left: 2, size: 2 });
+        assert_eq!(crop.rows(6).collect::<Vec<_>>(), [24..30, 42..48]);
+        let message = Crop::centre(4, 6, 5).unwrap_err().to_string();
+        assert_eq!(message, "crop: expected at most the image, 4 x 6, found 5 x 5");
+    }
+}

@@ -29,6 +29,8 @@
 mod crop;
 mod error;
 mod file;
+#[cfg(test)]
+mod fixture;
 mod normalise;
 mod sample;
 mod store;

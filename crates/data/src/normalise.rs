@@ -181,3 +181,93 @@ fn scale(v: f32, min: f32, max: f32) -> f32 {
 fn unscale(v: f32, min: f32, max: f32) -> f32 {
     min + 0.5 * (v + 1.0) * (max - min)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::episode;
+    use proptest::prelude::*;
+
+    fn fit(rows: usize, margin: f32) -> Normaliser {
+        Normaliser::fit(&[episode(rows)], &NormaliserConfig { margin, ..NormaliserConfig::default() })
+            .unwrap()
+    }
+
+    #[test]
+    fn positions_span_minus_one_to_one_and_quaternions_pass() {
+        let (e, n) = (episode(11), fit(11, 0.0));
+        let (first, last) = (n.normalise_state(&e.state[0]), n.normalise_state(&e.state[10]));
+        for i in 0..STATE_DIM {
+            let (low, high) =
+                if STATE_SCALED.contains(&i) { (-1.0, 1.0) } else { (e.state[0][i], e.state[10][i]) };
+            assert!((first[i] - low).abs() < 1e-5 && (last[i] - high).abs() < 1e-5, "entry {i}");
+        }
+        assert!((fit(11, 0.1).normalise_state(&e.state[10])[0] - 1.0 / 1.1).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_gripper_command_is_scaled_by_what_it_means() {
+        let n = fit(5, 0.1);
+        let command = |g| n.normalise_action(&[0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, g])[7];
+        assert_eq!((command(0.0), command(1.0)), (-1.0, 1.0));
+    }
+
+    #[test]
+    fn constant_entries_are_shifted_and_not_scaled() {
+        let n = fit(1, 0.0);
+        let mut state = episode(1).state[0];
+        assert_eq!(n.normalise_state(&state)[7], 0.0);
+        state[7] += 0.5;
+        assert!((n.normalise_state(&state)[7] - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn ranges_pass_through_lists_and_bad_ones_are_refused() {
+        let n = fit(7, 0.0);
+        let mut list = n.to_vec();
+        assert_eq!(Normaliser::from_slice(&list).unwrap(), n);
+        assert_eq!(serde_json::from_str::<Normaliser>(&serde_json::to_string(&n).unwrap()).unwrap(), n);
+        assert!(matches!(Normaliser::from_slice(&list[1..]), Err(Error::Length { expected: 46, found: 45 })));
+        list[15] = f32::NAN;
+        assert!(matches!(Normaliser::from_slice(&list), Err(Error::Range { column: "state", index: 0, .. })));
+    }
+
+    #[test]
+    fn nothing_and_not_a_number_are_refused() {
+        let config = NormaliserConfig::default();
+        assert!(matches!(Normaliser::fit::<Episode>(&[], &config), Err(Error::NoRows)));
+        let mut e = episode(4);
+        e.action[2][1] = f32::NAN;
+        assert!(matches!(
+            Normaliser::fit(&[e], &config),
+            Err(Error::Range { column: "action", index: 1, .. })
+        ));
+        assert_eq!(NormaliserConfig { margin: -1.0, min_range: f32::NAN }.validate().len(), 2);
+    }
+
+    proptest! {
+        #[test]
+        fn there_and_back_is_the_same(
+            rows in prop::collection::vec(prop::array::uniform15(-1.0_f32..1.0), 1..20), margin in 0.0_f32..0.3,
+            p in prop::array::uniform3(-2.0_f32..2.0), q in prop::array::uniform4(-1.0_f32..1.0), g in 0.0_f32..1.0,
+        ) {
+            prop_assume!(q.iter().map(|v| v * v).sum::<f32>() > 0.01);
+            let norm = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+            let mut e = episode(rows.len());
+            for (t, row) in rows.iter().enumerate() {
+                e.state[t] = *row;
+                e.action[t][..3].copy_from_slice(&row[..3]);
+            }
+            let n = Normaliser::fit(&[e], &NormaliserConfig { margin, ..NormaliserConfig::default() }).unwrap();
+            let action = [p[0], p[1], p[2], q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm, g];
+            let back = n.unnormalise_action(&n.normalise_action(&action));
+            prop_assert!(back.iter().zip(&action).all(|(a, b)| (a - b).abs() < 1e-5), "{back:?} of {action:?}");
+            for row in &rows {
+                let scaled = n.normalise_state(row);
+                prop_assert!(scaled.iter().all(|v| v.abs() <= 1.0 + 1e-5));
+                let back = n.unnormalise_state(&scaled);
+                prop_assert!(back.iter().zip(row).all(|(a, b)| (a - b).abs() < 1e-5));
+            }
+        }
+    }
+}

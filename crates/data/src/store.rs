@@ -154,3 +154,133 @@ fn io(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> Error {
     let path = path.to_owned();
     move |source| Error::Io { action, path: path.clone(), source }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::episode;
+    use proptest::prelude::*;
+
+    fn store() -> (tempfile::TempDir, EpisodeStore) {
+        let folder = tempfile::tempdir().unwrap();
+        let store = EpisodeStore::open(folder.path().join("episodes")).unwrap();
+        (folder, store)
+    }
+
+    /// The message of what `name` is refused with, once it holds `bytes`; reading and checking agree that it is bad.
+    fn refusal(bytes: &[u8]) -> String {
+        let (_folder, store) = store();
+        fs::write(store.path("a").unwrap(), bytes).unwrap();
+        assert!(matches!(store.check(), Err(Error::Store { problems }) if problems.len() == 1));
+        let message = store.read("a").unwrap_err().to_string();
+        assert!(message.contains("a.safetensors"), "{message}");
+        message
+    }
+
+    fn bytes(rows: usize) -> Vec<u8> {
+        encode(&episode(rows), Path::new("a")).unwrap()
+    }
+
+    #[test]
+    fn names_are_sorted_and_summaries_read_headers() {
+        let (_folder, store) = store();
+        for (name, rows) in [("b", 3), ("a", 5), ("empty", 0)] {
+            store.write(name, &episode(rows)).unwrap();
+        }
+        assert_eq!(store.names().unwrap(), ["a", "b", "empty"]);
+        let summaries = store.check().unwrap();
+        assert_eq!(summaries.iter().map(|s| s.rows).collect::<Vec<_>>(), [5, 3, 0]);
+        assert_eq!(summaries[0].cameras, ["wrist", "table"]);
+        assert_eq!(summaries[0].outcome, Outcome::Success { at: 2 });
+        assert_eq!(store.read("empty").unwrap(), episode(0));
+    }
+
+    #[test]
+    fn the_same_episode_gives_the_same_bytes() {
+        assert_eq!(bytes(4), bytes(4));
+    }
+
+    #[test]
+    fn a_writer_killed_before_the_rename_leaves_the_old_file() {
+        let (_folder, store) = store();
+        store.write("a", &episode(3)).unwrap();
+        // What a killed process leaves: the new file under its temporary name, never removed.
+        let (_, left) = store.stage("a", &episode(9)).unwrap().keep().unwrap();
+        assert!(left.exists());
+        assert_eq!(store.read("a").unwrap(), episode(3));
+        assert_eq!(store.names().unwrap(), ["a"]);
+        store.write("a", &episode(9)).unwrap();
+        assert_eq!(store.read("a").unwrap(), episode(9));
+    }
+
+    #[test]
+    fn truncated_files_are_refused_at_every_length() {
+        let whole = bytes(2);
+        for length in (0..whole.len()).step_by(17).chain([whole.len() - 1]) {
+            refusal(&whole[..length]);
+        }
+        let mut longer = whole;
+        longer.push(0);
+        refusal(&longer);
+    }
+
+    #[test]
+    fn foreign_files_are_refused_by_what_they_lack() {
+        assert!(refusal(b"not safetensors at all").contains("expected a whole safetensors file"));
+        let foreign =
+            safetensors::serialize(Vec::<(String, safetensors::tensor::TensorView)>::new(), None).unwrap();
+        assert!(refusal(&foreign).contains("expected key `auto_e2h.episode`"));
+        let text = |from: &str, to: &str| {
+            assert_eq!(from.len(), to.len());
+            let whole = bytes(2);
+            let at = whole.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+            [&whole[..at], to.as_bytes(), &whole[at + from.len()..]].concat()
+        };
+        let message = refusal(&text("format\\\":1", "format\\\":7"));
+        assert!(message.contains("format: expected 1, found 7"), "{message}");
+        assert!(refusal(&text("\"action\"", "\"aktion\"")).contains("aktion"));
+        let message = refusal(&text("\"shape\":[2,15]", "\"shape\":[15,2]"));
+        assert!(message.contains("expected F32"), "{message}");
+    }
+
+    #[test]
+    fn an_episode_that_contradicts_itself_is_not_written() {
+        let (_folder, store) = store();
+        store.write("a", &episode(3)).unwrap();
+        let mut bad = episode(4);
+        bad.action.pop();
+        assert!(matches!(store.write("a", &bad), Err(Error::Episode { .. })));
+        bad = episode(4);
+        bad.state[1][2] = f32::INFINITY;
+        assert!(store.write("a", &bad).is_err());
+        assert_eq!(store.read("a").unwrap(), episode(3));
+        assert_eq!(fs::read_dir(&store.folder).unwrap().count(), 1, "nothing half-written is left");
+    }
+
+    #[test]
+    fn names_stay_in_the_folder() {
+        let (_folder, store) = store();
+        for name in ["", "../a", ".a", "a/b", "a b"] {
+            assert!(matches!(store.write(name, &episode(1)), Err(Error::Name { .. })), "{name}");
+        }
+        assert!(matches!(store.read("missing"), Err(Error::Io { action: "read", .. })));
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(32))]
+        #[test]
+        fn what_is_written_is_read(
+            numbers in prop::collection::vec(-1e30_f32..1e30, 1..12), terminal: bool, reversed: bool, task in ".{0,12}",
+        ) {
+            let (_folder, store) = store();
+            let mut e = episode(numbers.len());
+            for (t, v) in numbers.iter().enumerate() {
+                (e.state[t][14], e.action[t][0], e.source[t]) = (*v, -v, u32::MAX - t as u32);
+            }
+            (e.terminal, e.origin.reversed, e.origin.task) = (terminal, reversed, task);
+            store.write("a-1.b_c", &e).unwrap();
+            prop_assert_eq!(store.read("a-1.b_c").unwrap(), e);
+            prop_assert_eq!(store.check().unwrap().len(), 1);
+        }
+    }
+}

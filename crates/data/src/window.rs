@@ -129,3 +129,76 @@ impl Windows {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::episode;
+    use proptest::prelude::*;
+
+    fn window(rows: usize, terminal: bool, alignment: Alignment, index: usize) -> Window {
+        let e = Episode { terminal, ..episode(rows) };
+        let config = WindowConfig { horizon: 4, alignment, ..WindowConfig::default() };
+        Windows::new(&[e], &config).window(index)
+    }
+
+    #[test]
+    fn the_first_row_is_repeated_before_the_start() {
+        let w = window(10, true, Alignment::Paper, 0);
+        assert_eq!((w.observations, w.actions, w.mask), (vec![0, 0], vec![0, 1, 2, 3], vec![true; 4]));
+        let w = window(10, true, Alignment::LeRobot, 0);
+        assert_eq!((w.observations, w.actions, w.mask), (vec![0, 0], vec![0, 0, 1, 2], vec![true; 4]));
+    }
+
+    #[test]
+    fn the_end_of_a_task_repeats_and_the_end_of_a_cut_is_masked() {
+        let w = window(10, true, Alignment::Paper, 8);
+        assert_eq!((w.observations, w.actions, w.mask), (vec![7, 8], vec![8, 9, 9, 9], vec![true; 4]));
+        let w = window(10, false, Alignment::Paper, 8);
+        assert_eq!((w.actions, w.mask), (vec![8, 9, 9, 9], vec![true, true, false, false]));
+        let w = window(10, false, Alignment::LeRobot, 8);
+        assert_eq!((w.actions, w.mask), (vec![7, 8, 9, 9], vec![true, true, true, false]));
+    }
+
+    #[test]
+    fn all_problems_are_listed() {
+        let config = WindowConfig { n_obs_steps: 0, horizon: 0, ..WindowConfig::default() };
+        assert_eq!(config.validate().len(), 2);
+        let config = WindowConfig { n_obs_steps: 3, horizon: 2, alignment: Alignment::LeRobot };
+        assert_eq!(config.validate(), ["horizon: expected at least 3, got 2"]);
+    }
+
+    proptest! {
+        #[test]
+        fn every_row_is_the_newest_of_one_window_inside_its_episode(
+            lengths in prop::collection::vec((0_usize..30, any::<bool>()), 0..8),
+            n_obs_steps in 1_usize..5, horizon in 5_usize..20, lerobot: bool,
+        ) {
+            let episodes: Vec<Episode> =
+                lengths.iter().map(|&(n, terminal)| Episode { terminal, ..episode(n) }).collect();
+            let alignment = if lerobot { Alignment::LeRobot } else { Alignment::Paper };
+            let windows = Windows::new(&episodes, &WindowConfig { n_obs_steps, horizon, alignment });
+            let rows = lengths.iter().enumerate().flat_map(|(e, &(n, _))| (0..n).map(move |t| (e, t)));
+            prop_assert_eq!(windows.len(), rows.clone().count());
+            for (i, (e, t)) in rows.enumerate() {
+                let (n, terminal) = lengths[e];
+                let w = windows.window(i);
+                prop_assert_eq!(w.episode, e);
+                prop_assert_eq!(w.observations.last(), Some(&t));
+                prop_assert_eq!((w.observations.len(), w.actions.len(), w.mask.len()), (n_obs_steps, horizon, horizon));
+                prop_assert!(w.observations.iter().chain(&w.actions).all(|&r| r < n));
+                for rows in [&w.observations, &w.actions] {
+                    prop_assert!(rows.windows(2).all(|p| p[1] == p[0] + 1 || p[0] == p[1] && (p[0] == 0 || p[0] == n - 1)));
+                }
+                // Padding at the start: as many copies as rows are missing.
+                let copies = w.observations.iter().filter(|&&r| r == 0).count();
+                prop_assert_eq!(copies, n_obs_steps.saturating_sub(t));
+                let lead = if lerobot { n_obs_steps - 1 } else { 0 };
+                let past = (t + horizon).saturating_sub(lead).saturating_sub(n).min(horizon);
+                let masked = w.mask.iter().filter(|&&m| !m).count();
+                prop_assert_eq!(masked, if terminal { 0 } else { past });
+                prop_assert!(w.mask.windows(2).all(|p| p[0] || !p[1]));
+            }
+        }
+    }
+}

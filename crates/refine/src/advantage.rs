@@ -154,3 +154,102 @@ pub(crate) fn split(episode: &Episode, fates: Vec<Fate>) -> Refined {
     let segments = runs(&kept, true).into_iter().map(segment).collect();
     Refined::new(segments, fates, episode_speeds(episode))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::{along, walk};
+
+    fn bumpy(rows: usize) -> Vec<f32> {
+        (0..rows).map(|t| (t as f32 * 0.37).sin() * 0.2 + t as f32 * 0.003).collect()
+    }
+
+    #[test]
+    fn one_step_ahead_smoothed_is_the_slope_of_the_value() {
+        let (values, config) = (bumpy(80), AdvantageConfig { horizon: 100, ..AdvantageConfig::default() });
+        let a = advantages(&values, &config);
+        for t in 15..=80 - 17 {
+            let slope = (values[t + 16] - values[t - 15]) / 31.0;
+            assert!((a[t] - (slope - 0.005)).abs() < 1e-6, "row {t}");
+        }
+    }
+
+    #[test]
+    fn lambda_one_is_the_sum_of_all_that_follows() {
+        let values = bumpy(20);
+        let config =
+            AdvantageConfig { gamma: 0.9, lambda: 1.0, smooth: 1, horizon: 10, ..AdvantageConfig::default() };
+        let a = advantages(&values, &config);
+        for (t, got) in a.into_iter().enumerate() {
+            let v = |i: usize| f64::from(values[i.min(19)]);
+            let brute: f64 =
+                (t..20).map(|i| 0.9_f64.powi((i - t) as i32) * (-0.05 + 0.9 * v(i + 1) - v(i))).sum();
+            assert!((f64::from(got) - brute).abs() < 1e-6, "row {t}");
+        }
+    }
+
+    #[test]
+    fn short_runs_are_joined_first_to_what_is_kept_then_to_what_is_dropped() {
+        let scores = |pieces: &[(usize, f64)]| -> Vec<f64> {
+            pieces.iter().flat_map(|&(n, v)| std::iter::repeat_n(v, n)).collect()
+        };
+        let count = |fates: &[Fate], fate| fates.iter().filter(|&&f| f == fate).count();
+        // 29 low frames are too few to drop, 30 are not.
+        let fates = judge(&scores(&[(40, 1.0), (29, -1.0), (40, 1.0)]), 0.0, 30);
+        assert_eq!(count(&fates, Fate::Kept), 109);
+        let fates = judge(&scores(&[(40, 1.0), (30, -1.0), (29, 1.0)]), 0.0, 30);
+        assert_eq!((count(&fates, Fate::LowAdvantage), count(&fates, Fate::TooShort)), (30, 29));
+        // The short drop is kept before keeps are measured: 20 + 10 + 20 is long enough.
+        let fates = judge(&scores(&[(30, -1.0), (20, 1.0), (10, -1.0), (20, 1.0)]), 0.0, 30);
+        assert_eq!(count(&fates, Fate::Kept), 50);
+        // Under 60 frames the mean decides.
+        assert_eq!(count(&judge(&scores(&[(40, 1.0), (19, -1.0)]), 0.0, 30), Fate::Kept), 59);
+        assert_eq!(count(&judge(&scores(&[(40, -1.0), (19, 1.0)]), 0.0, 30), Fate::LowAdvantage), 59);
+    }
+
+    #[test]
+    fn the_threshold_is_pooled_and_segments_keep_their_actions() {
+        let mut long = along(&walk(&[(199, 0.01)]));
+        long.action.iter_mut().enumerate().for_each(|(t, a)| a[0] = t as f32);
+        let stalls: Vec<f32> =
+            (0..200_i16).map(|t| 0.005 * f32::from(t.min(70) + (t - 130).max(0))).collect();
+        let steady: Vec<f32> = (0..200_i16).map(|t| 0.005 * f32::from(t)).collect();
+        let refined = advantage_filter(
+            &[&long, &long],
+            &[stalls, steady],
+            &AdvantageConfig { percentile: 10.0, ..AdvantageConfig::default() },
+        )
+        .unwrap();
+        assert_eq!(refined[1].report.kept, 200);
+        assert_eq!(refined[0].segments.len(), 2);
+        let [a, b] = &refined[0].segments[..] else { panic!("two segments") };
+        assert!(!a.terminal && b.terminal);
+        assert_eq!(a.action[a.len() - 1][0] as usize, a.len() - 1);
+        assert_eq!(refined[0].report.kept, a.len() + b.len());
+        assert_eq!(refined[0].threshold, refined[1].threshold);
+        assert!(
+            refined.iter().all(|r| r.value.is_some() && r.advantage.as_ref().is_some_and(|a| a.len() == 200))
+        );
+    }
+
+    #[test]
+    fn about_the_percentile_of_frames_lies_below_the_threshold() {
+        let values: Vec<Vec<f32>> = (0..5).map(|i| bumpy(100 + 40 * i)).collect();
+        let episodes: Vec<Episode> = values.iter().map(|v| along(&vec![0.0; v.len()])).collect();
+        let refined = advantage_filter(&episodes, &values, &AdvantageConfig::default()).unwrap();
+        let all: Vec<f32> = refined.iter().flat_map(|r| r.advantage.clone().unwrap()).collect();
+        let below = all.iter().filter(|&&a| a < refined[0].threshold.unwrap()).count();
+        assert!((below as f64 / all.len() as f64 - 0.3).abs() < 0.005, "{below} of {}", all.len());
+    }
+
+    #[test]
+    fn values_that_do_not_fit_are_refused() {
+        let e = along(&[0.0; 3]);
+        let config = AdvantageConfig::default();
+        let refuse = |values: &[Vec<f32>]| advantage_filter(&[&e], values, &config).unwrap_err();
+        assert!(matches!(refuse(&[]), Error::Episodes { expected: 1, found: 0, .. }));
+        assert!(matches!(refuse(&[vec![0.0; 2]]), Error::Frames { expected: 3, found: 2, .. }));
+        assert!(matches!(refuse(&[vec![0.0, f32::NAN, 0.0]]), Error::NotFinite { row: 1, .. }));
+        assert!(advantage_filter::<Episode>(&[], &[], &config).unwrap().is_empty());
+    }
+}

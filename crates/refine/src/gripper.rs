@@ -60,3 +60,34 @@ impl GateConfig {
 pub fn gate(episode: &Episode, config: &GateConfig, reverse: &ReverseConfig) -> bool {
     !config.enabled || gripper_switches(episode, reverse) == (config.closings, config.openings)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::{along, reversal};
+
+    fn with_openings(openings: &[f32]) -> Episode {
+        let mut e = along(&vec![0.0; openings.len()]);
+        for (s, w) in e.state.iter_mut().zip(openings) {
+            s[14] = *w;
+        }
+        e
+    }
+
+    #[test]
+    fn switches_are_counted_with_hysteresis() {
+        let wobble = with_openings(&[0.08, 0.074, 0.08, 0.05, 0.07, 0.05, 0.08]);
+        assert_eq!(gripper_switches(&wobble, &reversal()), (1, 1));
+        let twice = with_openings(&[0.08, 0.05, 0.08, 0.05]);
+        assert_eq!(gripper_switches(&twice, &reversal()), (2, 1));
+        assert_eq!(gripper_switches(&along(&[]), &reversal()), (0, 0));
+    }
+
+    #[test]
+    fn the_gate_asks_for_one_of_each_unless_it_is_off() {
+        let regrasp = with_openings(&[0.08, 0.05, 0.08, 0.05, 0.08]);
+        assert!(!gate(&regrasp, &GateConfig::default(), &reversal()));
+        assert!(gate(&regrasp, &GateConfig { enabled: false, ..GateConfig::default() }, &reversal()));
+        assert!(gate(&with_openings(&[0.08, 0.05, 0.08]), &GateConfig::default(), &reversal()));
+    }
+}

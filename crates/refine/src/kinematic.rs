@@ -162,3 +162,6 @@ fn assemble(episode: &Episode, nodes: &[Node], reverse: &ReverseConfig) -> Episo
     out.action = goals(&poses, &open_states(&out, reverse), reverse);
     out
 }
+
+#[cfg(test)]
+mod tests;

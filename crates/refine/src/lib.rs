@@ -27,6 +27,8 @@ mod advantage;
 mod compose;
 mod error;
 mod fate;
+#[cfg(test)]
+mod fixture;
 mod gripper;
 mod kinematic;
 mod motion;

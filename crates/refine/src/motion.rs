@@ -86,3 +86,60 @@ pub(crate) fn protected(episode: &Episode, config: &KinematicConfig, reverse: &R
     }
     mask
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::{along, reversal};
+
+    fn poses(x: &[f64]) -> Vec<Pose> {
+        x.iter().map(|&x| Pose::from_row(&[x as f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])).collect()
+    }
+
+    fn assert_close(got: &[f64], want: &[f64]) {
+        assert_eq!(got.len(), want.len());
+        assert!(got.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-6), "{got:?}, expected {want:?}");
+    }
+
+    #[test]
+    fn speed_is_that_of_the_step_ahead_in_metres_per_second() {
+        // 2 mm a frame at 20 Hz are 0.04 m/s; the last row gets the step that reached it.
+        assert_close(&motion(&poses(&[0.0, 0.002, 0.005, 0.010]), 0).speed, &[0.04, 0.06, 0.1, 0.1]);
+        assert_close(&motion(&poses(&[0.3]), 0).speed, &[0.0]);
+        assert_close(&motion(&poses(&[]), 3).speed, &[]);
+    }
+
+    #[test]
+    fn a_window_sees_through_jitter() {
+        let jitter: Vec<f64> = (0..9).map(|t| 0.003 * f64::from(t % 2)).collect();
+        assert!(motion(&poses(&jitter), 0).speed.iter().all(|&v| v > 0.05));
+        // Row 4 compares rows 1 and 7, both at 3 mm; row 0 only rows 0 and 3.
+        let seen = motion(&poses(&jitter), 3).speed;
+        assert_close(&[seen[0], seen[4]], &[0.003 * 20.0 / 3.0, 0.0]);
+    }
+
+    #[test]
+    fn turning_is_measured_either_way_round() {
+        let a = Pose::from_row(&[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]);
+        let (s, c) = (0.15_f64.sin() as f32, 0.15_f64.cos() as f32);
+        for sign in [1.0, -1.0] {
+            let b = Pose::from_row(&[0.0, 0.0, 0.0, sign * c, 0.0, 0.0, sign * s]);
+            assert!((turn(&a, &b) - 0.3).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn protection_covers_switch_and_motion() {
+        let mut e = along(&[0.0; 40]);
+        for (t, s) in e.state.iter_mut().enumerate().skip(20) {
+            // Rows 20 and 21 move, the hysteresis switches at 21.
+            s[14] = if t == 20 { 0.07 } else { 0.05 };
+        }
+        let config = KinematicConfig::default();
+        let mask = protected(&e, &config, &reversal());
+        let expected: Vec<bool> = (0..40).map(|t| (14..=26).contains(&t)).collect();
+        assert_eq!(mask, expected);
+        let off = KinematicConfig { protect_gripper: false, ..config };
+        assert!(!protected(&e, &off, &reversal()).contains(&true));
+    }
+}

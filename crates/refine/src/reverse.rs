@@ -97,3 +97,64 @@ pub(crate) fn goals(poses: &[Pose], open: &[bool], config: &ReverseConfig) -> Ve
     };
     (0..poses.len()).map(goal).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::{along, reversal, walk};
+
+    #[test]
+    fn states_images_and_sources_run_backwards() {
+        let easy = along(&walk(&[(4, 0.01)]));
+        let hard = reverse(&easy, &reversal());
+        assert_eq!(hard.source, [4, 3, 2, 1, 0]);
+        assert_eq!(hard.state[0], easy.state[4]);
+        assert_eq!(hard.frames[0].image(0), [4, 4, 4]);
+        assert!(hard.origin.reversed && hard.terminal);
+        let again = reverse(&hard, &reversal());
+        assert_eq!((&again.state, &again.frames, &again.source), (&easy.state, &easy.frames, &easy.source));
+        assert!(!again.origin.reversed);
+    }
+
+    #[test]
+    fn goals_are_the_poses_ahead_and_the_last_one_repeats() {
+        for (lookahead, expected) in [(1, [0.02, 0.01, 0.0, 0.0]), (2, [0.01, 0.0, 0.0, 0.0])] {
+            let hard = reverse(&along(&[0.0, 0.01, 0.02, 0.03]), &ReverseConfig { lookahead, ..reversal() });
+            assert_eq!(hard.action.iter().map(|a| a[0]).collect::<Vec<_>>(), expected);
+        }
+    }
+
+    #[test]
+    fn goals_lie_in_the_hemisphere_of_the_reference() {
+        let mut e = along(&[0.0, 0.01]);
+        e.state[1][4] = -1.0;
+        rebuild_actions(&mut e, &reversal());
+        assert_eq!(e.action[0][3..7], [0.0, 1.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn the_command_follows_the_next_opening_with_hysteresis() {
+        let mut e = along(&[0.0; 8]);
+        // 0.0760 is the upper, 0.0680 the lower threshold.
+        for (s, w) in e.state.iter_mut().zip([0.080, 0.074, 0.070, 0.060, 0.070, 0.075, 0.077, 0.070]) {
+            s[14] = w;
+        }
+        rebuild_actions(&mut e, &reversal());
+        assert_eq!(
+            e.action.iter().map(|a| a[7]).collect::<Vec<_>>(),
+            [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
+        );
+    }
+
+    #[test]
+    fn an_empty_episode_stays_empty() {
+        assert!(reverse(&along(&[]), &reversal()).is_empty());
+    }
+
+    #[test]
+    fn all_problems_are_listed() {
+        let config = ReverseConfig { lookahead: 0, open_width_m: f64::NAN, open_at: 0.1, ..reversal() };
+        assert_eq!(config.validate().len(), 3);
+        assert!(reversal().validate().is_empty());
+    }
+}

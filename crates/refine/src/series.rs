@@ -44,3 +44,31 @@ pub fn runs(mask: &[bool], wanted: bool) -> Vec<Range<usize>> {
     }
     found
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn averages_shrink_at_the_ends() {
+        assert_eq!(moving_average(&[1.0, 2.0, 6.0, 3.0], 3), [1.5, 3.0, 11.0 / 3.0, 4.5]);
+        assert_eq!(moving_average(&[1.0, 2.0], 1), [1.0, 2.0]);
+    }
+
+    #[test]
+    fn percentiles_lie_between_neighbours() {
+        let values: Vec<f64> = (0..=10).rev().map(f64::from).collect();
+        assert_eq!(percentile(&values, 30.0), Some(3.0));
+        assert_eq!(percentile(&values, 25.0), Some(2.5));
+        assert_eq!(percentile(&values, 100.0), Some(10.0));
+        assert_eq!(percentile(&[], 30.0), None);
+    }
+
+    #[test]
+    fn runs_are_maximal() {
+        let mask = [true, true, false, true];
+        assert_eq!(runs(&mask, true), [0..2, 3..4]);
+        assert_eq!(runs(&mask, false), vec![2..3; 1]);
+        assert!(runs(&[], true).is_empty());
+    }
+}

@@ -65,3 +65,25 @@ pub fn cut_suffix(episode: &Episode, values: &[f32], config: &SuffixConfig) -> R
     refined.value = Some(values.to_vec());
     Ok(refined)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fixture::along;
+
+    #[test]
+    fn the_suffix_goes_20_frames_after_the_value_has_stayed_high() {
+        let e = along(&[0.0; 60]);
+        let mut values = vec![0.0; 60];
+        values[5..9].fill(0.95); // four in a row are one too few
+        values[20..30].fill(0.9);
+        let on = SuffixConfig { enabled: true, ..SuffixConfig::default() };
+        let refined = cut_suffix(&e, &values, &on).unwrap();
+        assert_eq!((refined.report.kept, refined.report.after_goal), (45, 15));
+        assert!(refined.segments[0].terminal);
+        assert_eq!(cut_suffix(&e, &values, &SuffixConfig::default()).unwrap().report.kept, 60);
+        values[54..].fill(1.0);
+        values[20..30].fill(0.0);
+        assert_eq!(cut_suffix(&e, &values, &on).unwrap().report.kept, 60);
+    }
+}

@@ -1,4 +1,45 @@
 //! The closed loop of Auto-E2H: collection, iteration, evaluation, run directory and report.
+//!
+//! A [`Run`] is the method with its stages as functions; `examples/nut_assembly.rs` reads them top to bottom.
+//!
+//! ```no_run
+//! use e2h_learn::{Run, RunOptions};
+//!
+//! let options = RunOptions {
+//!     task: "nut_assembly".to_owned(),
+//!     preset: "smoke".to_owned(),
+//!     seed: 0,
+//!     set: vec!["loop.cycles=2".to_owned()],
+//!     out: None,
+//!     resume: false,
+//!     threads: None,
+//!     quiet: false,
+//! };
+//! let run = Run::open(&options)?;
+//! let base = run.demonstrations()?;
+//! let hard = run.train_initial(&base)?;
+//! let record = run.evaluate(0, &hard, None)?;
+//! println!("{} of {}", record.evaluation.successes, record.evaluation.trials);
+//! # Ok::<(), e2h_learn::Error>(())
+//! ```
 
+mod collect;
+pub mod config;
+mod directory;
+mod error;
+mod evaluate;
+mod picture;
+mod progress;
+mod published;
 pub mod record;
 pub mod report;
+mod rollout;
+mod run;
+
+pub use collect::{Collected, collect};
+pub use config::{Resolved, RunConfig};
+pub use error::{Error, Result};
+pub use evaluate::{Trial, evaluate, film};
+pub use progress::{Bar, Progress};
+pub use published::Published;
+pub use run::{Accepted, Base, Run, RunOptions, set_threads};

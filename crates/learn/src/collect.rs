@@ -1,0 +1,175 @@
+//! Closed-loop collection: the hard policy, then the easy policy from where it ended, and so on.
+
+use crate::config::{AfterFailure, LoopConfig};
+use crate::rollout::{Finished, Lane, Rollout, drive};
+use crate::{Error, Progress, Result};
+use e2h_core::{Direction, Episode, Kind, Origin, Outcome, Policy, stream};
+use e2h_env::Env;
+use std::collections::{BTreeMap, VecDeque};
+
+/// What one round of the closed loop brought. Source: the paper's equation 2.
+#[derive(Debug, Default)]
+pub struct Collected {
+    /// All hard rollouts, in cycle order: the critic learns from successes and failures.
+    pub hard: Vec<Episode>,
+    /// Easy rollouts that succeeded and began at the hard goal, so that their reversal ends there; in cycle order.
+    pub easy: Vec<Episode>,
+    /// Easy rollouts started.
+    pub easy_rollouts: usize,
+    /// Easy rollouts that succeeded.
+    pub easy_successes: usize,
+    /// External resets by cause.
+    pub resets: BTreeMap<String, usize>,
+}
+
+/// One loop's own state.
+struct Loop {
+    cycles: VecDeque<usize>,
+    /// The easy rollout in progress began with the object at the hard goal.
+    at_goal: bool,
+    collected: Collected,
+}
+
+/// Runs `config.cycles` cycles, spread over `envs` (one loop each).
+///
+/// # Errors
+/// When the observations do not fit the policies or the simulation fails.
+pub fn collect(
+    envs: Vec<Env>,
+    hard: &dyn Policy,
+    easy: &dyn Policy,
+    config: &LoopConfig,
+    origin: &Origin,
+    progress: &Progress,
+) -> Result<Collected> {
+    let n = envs.len();
+    if n == 0 {
+        return Err(Error::Config("collection needs at least one simulation".to_owned()));
+    }
+    let (seed, iteration) = (origin.seed, u64::from(origin.iteration));
+    let origin_of = |direction: Direction, cycle: usize| Origin {
+        direction,
+        kind: Kind::Rollout,
+        episode: u32::try_from(cycle).unwrap_or(u32::MAX),
+        reversed: false,
+        ..origin.clone()
+    };
+    let begin = |lane: &mut Lane<Loop>, direction: Direction| -> Result<()> {
+        let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
+        let (policy, purpose) = match direction {
+            Direction::Hard => (hard, "collect/act/hard"),
+            Direction::Easy => (easy, "collect/act/easy"),
+        };
+        let rng = stream(seed, purpose, iteration, cycle as u64);
+        let record = Some(origin_of(direction, cycle));
+        lane.rollout = Some(Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, record)?);
+        Ok(())
+    };
+    let reset = |lane: &mut Lane<Loop>, direction: Direction, cause: &str| -> Result<()> {
+        let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
+        let purpose = if direction == Direction::Hard { "collect/reset/hard" } else { "collect/reset/easy" };
+        *lane.state.collected.resets.entry(cause.to_owned()).or_default() += 1;
+        Ok(lane.env.reset(direction, &mut stream(seed, purpose, iteration, cycle as u64))?)
+    };
+    let next = |lane: &mut Lane<Loop>, finished: Finished, direction: Direction| -> Result<()> {
+        let Some(episode) = finished.episode else { return Ok(()) };
+        let success = finished.outcome.is_success();
+        let diverged = finished.outcome == Outcome::Diverged;
+        match direction {
+            Direction::Hard => {
+                lane.state.collected.hard.push(episode);
+                lane.state.at_goal = true;
+                match (success, diverged, config.after_failure) {
+                    (_, true, _) => reset(lane, Direction::Easy, "diverged")?,
+                    (false, _, AfterFailure::Assembled) => reset(lane, Direction::Easy, "hard_failed")?,
+                    _ => {
+                        lane.state.at_goal = success;
+                        if config.homing {
+                            lane.env.home()?;
+                        }
+                    }
+                }
+                lane.state.collected.easy_rollouts += 1;
+                begin(lane, Direction::Easy)
+            }
+            Direction::Easy => {
+                if success {
+                    lane.state.collected.easy_successes += 1;
+                    if lane.state.at_goal {
+                        lane.state.collected.easy.push(episode);
+                    }
+                }
+                lane.state.cycles.pop_front();
+                if lane.state.cycles.is_empty() {
+                    return Ok(());
+                }
+                match (success, diverged) {
+                    (_, true) => reset(lane, Direction::Hard, "diverged")?,
+                    (false, _) => reset(lane, Direction::Hard, "easy_failed")?,
+                    (true, _) if config.homing => lane.env.home()?,
+                    _ => {}
+                }
+                begin(lane, Direction::Hard)
+            }
+        }
+    };
+
+    let mut lanes: Vec<Lane<Loop>> = envs
+        .into_iter()
+        .enumerate()
+        .map(|(i, env)| Lane {
+            env,
+            rollout: None,
+            state: Loop {
+                cycles: (i..config.cycles).step_by(n).collect(),
+                at_goal: false,
+                collected: Collected::default(),
+            },
+        })
+        .collect();
+    for lane in &mut lanes {
+        if !lane.state.cycles.is_empty() {
+            reset(lane, Direction::Hard, "start")?;
+            begin(lane, Direction::Hard)?;
+        }
+    }
+    let bar = progress.bar("collect", config.cycles as u64);
+    let summary = |lanes: &[Lane<Loop>]| {
+        let sum = |f: fn(&Collected) -> usize| lanes.iter().map(|l| f(&l.state.collected)).sum::<usize>();
+        let hard = sum(|c| c.hard.iter().filter(|e| e.outcome.is_success()).count());
+        let text = format!(
+            "hard {hard}/{} easy {}/{} succeeded",
+            sum(|c| c.hard.len()),
+            sum(|c| c.easy_successes),
+            sum(|c| c.easy_rollouts)
+        );
+        let left: usize = lanes.iter().map(|l| l.state.cycles.len()).sum();
+        (config.cycles - left, text)
+    };
+    drive(
+        &mut lanes,
+        hard,
+        easy,
+        &|lane, finished, direction| next(lane, finished, direction),
+        |lanes| {
+            let (done, text) = summary(lanes);
+            bar.set(done as u64, &text);
+        },
+    )?;
+    bar.finish(&summary(&lanes).1);
+
+    let mut all = Collected::default();
+    for lane in lanes {
+        let c = lane.state.collected;
+        all.hard.extend(c.hard);
+        all.easy.extend(c.easy);
+        all.easy_rollouts += c.easy_rollouts;
+        all.easy_successes += c.easy_successes;
+        for (cause, n) in c.resets {
+            *all.resets.entry(cause).or_default() += n;
+        }
+    }
+    all.hard.sort_by_key(|e| e.origin.episode);
+    all.easy.sort_by_key(|e| e.origin.episode);
+    Ok(all)
+}

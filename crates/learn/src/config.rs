@@ -1,0 +1,366 @@
+//! A run's configuration: preset < task file < `--set key=value`, checked before any work.
+
+use crate::{Error, Result};
+use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
+use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
+use e2h_refine::{AdvantageConfig, GateConfig, KinematicConfig, ReverseConfig, SuffixConfig};
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+const PRESETS: [(&str, &str); 3] = [
+    ("smoke", include_str!("../../../configs/presets/smoke.toml")),
+    ("laptop", include_str!("../../../configs/presets/laptop.toml")),
+    ("paper", include_str!("../../../configs/presets/paper.toml")),
+];
+
+const TASKS: [(&str, &str); 1] = [("nut_assembly", include_str!("../../../configs/tasks/nut_assembly.toml"))];
+
+/// Everything that a run depends on besides its seed. Each preset file states every entry; see there for the reasons.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// The task pair, its variant and its demonstrator.
+    pub task: TaskConfig,
+    /// Simulation and cameras.
+    pub env: EnvConfig,
+    /// The closed loop.
+    #[serde(rename = "loop")]
+    pub closed_loop: LoopConfig,
+    /// Architecture of both policies.
+    pub policy: PolicyConfig,
+    /// Their training.
+    pub train: StageConfig,
+    /// What becomes of reversed episodes.
+    pub refine: RefineConfig,
+    /// The critic.
+    pub critic: CriticStage,
+    /// Measuring success.
+    pub evaluation: EvaluationConfig,
+}
+
+/// The task pair of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TaskConfig {
+    /// Name in the registry.
+    pub name: String,
+    /// Variant of the scene.
+    pub variant: String,
+    /// How human the scripted demonstrators are.
+    pub demonstrator: DemonstratorConfig,
+}
+
+impl TaskConfig {
+    /// What the registry is asked with.
+    #[must_use]
+    pub fn options(&self) -> TaskOptions {
+        TaskOptions { variant: self.variant.clone(), demonstrator: self.demonstrator.clone() }
+    }
+}
+
+/// What follows a failed hard rollout.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum AfterFailure {
+    /// An external reset to the easy task's start, counted.
+    Assembled,
+    /// The easy policy goes on from wherever the hard one ended (the paper's literal loop).
+    Continue,
+}
+
+/// The closed loop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LoopConfig {
+    /// Easy demonstrations at the start.
+    pub demonstrations: usize,
+    /// Updates of the hard policy, N.
+    pub iterations: u32,
+    /// Cycles of a hard and an easy rollout before each update, C.
+    pub cycles: usize,
+    /// Loops side by side. Part of the configuration, not of the machine: results do not depend on the threads.
+    pub loops: usize,
+    /// What follows a failed hard rollout.
+    pub after_failure: AfterFailure,
+    /// True: the arm goes home by itself between rollouts (not recorded). False: the literal loop.
+    pub homing: bool,
+    /// True: an update sees everything accepted so far. False: this iteration's alone (the paper's).
+    pub accumulate: bool,
+    /// Share of every batch that is drawn from the initial demonstrations (the paper's: a half).
+    pub base_share: f32,
+    /// True: the initial demonstrations pass the kinematic filter too. False: the paper's algorithm 1.
+    pub refine_demonstrations: bool,
+    /// True: the easy policy learns from demonstrations that passed the kinematic filter.
+    pub refine_easy_demonstrations: bool,
+}
+
+/// Training steps and how a step looks.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StageConfig {
+    /// Steps of the easy policy.
+    pub easy_steps: usize,
+    /// Steps of the initial hard policy.
+    pub initial_steps: usize,
+    /// Steps of each update.
+    pub update_steps: usize,
+    /// Steps between two saved training states, for `--resume`.
+    pub save_every: usize,
+    /// Fraction by which the ranges of the normaliser are widened.
+    pub normaliser_margin: f32,
+    /// A step. The schedule's length is that of the stage.
+    pub step: TrainConfig,
+}
+
+/// Reversal and the filters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RefineConfig {
+    /// Equations 3 and 4.
+    pub reverse: ReverseConfig,
+    /// Equation 7; without it reversals stay as they are (`no-kinematic`).
+    pub kinematic_enabled: bool,
+    /// Thresholds of the kinematic filter.
+    pub kinematic: KinematicConfig,
+    /// A valid reversal grasps once and lets go once.
+    pub gate: GateConfig,
+    /// Equation 10.
+    pub advantage: AdvantageConfig,
+    /// Optional cut of the suffix.
+    pub suffix: SuffixConfig,
+}
+
+/// The critic's stage.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CriticStage {
+    /// False skips the critic and its filter (`no-critic`).
+    pub enabled: bool,
+    /// Network and training.
+    pub network: CriticConfig,
+}
+
+/// Measuring success.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EvaluationConfig {
+    /// Trials for each point of the curve.
+    pub trials: usize,
+    /// Seed of the trials, apart from every training seed.
+    pub seed: u64,
+    /// Simulations side by side.
+    pub parallel: usize,
+    /// Trials in the rollout animation of the report; 0 for none.
+    pub filmed: usize,
+}
+
+/// A configuration and where it came from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Resolved {
+    /// The preset's name.
+    pub preset: String,
+    /// The values.
+    pub config: RunConfig,
+    /// The same as text, complete: what is written into the run.
+    pub text: String,
+}
+
+impl RunConfig {
+    /// Reads preset, task file and overrides (`key.path=value`), later ones winning.
+    ///
+    /// # Errors
+    /// Unknown preset, task or key (the nearest known one is named), a value of the wrong type, or values that do not fit
+    /// together (all of them are listed).
+    pub fn resolve(preset: &str, task: &str, overrides: &[String]) -> Result<Resolved> {
+        let mut table = parse(preset, find("preset", preset, &PRESETS)?)?;
+        let of_task = parse(task, find("task", task, &TASKS)?)?;
+        // A task file has entries for all presets, and may have some for one alone.
+        let mut common = of_task.clone();
+        let special = common.remove("preset");
+        merge(&mut table, &common, "")?;
+        if let Some(Value::Table(special)) = special
+            && let Some(Value::Table(special)) = special.get(preset)
+        {
+            merge(&mut table, special, "")?;
+        }
+        for text in overrides {
+            let (key, value) = text
+                .split_once('=')
+                .ok_or_else(|| Error::Config(format!("--set: expected key=value, got `{text}`")))?;
+            let mut layer = Value::String(value.trim().to_owned());
+            // What is not TOML is taken as a plain string, so that quotes are not needed on the command line.
+            if let Ok(parsed) = format!("v = {value}").parse::<Table>()
+                && let Some(v) = parsed.get("v")
+            {
+                layer = v.clone();
+            }
+            for part in key.trim().split('.').rev() {
+                layer = Value::Table(Table::from_iter([(part.to_owned(), layer)]));
+            }
+            if let Value::Table(layer) = layer {
+                merge(&mut table, &layer, "")?;
+            }
+        }
+        Self::from_table(preset, table)
+    }
+
+    /// Reads a resolved configuration that a run wrote.
+    ///
+    /// # Errors
+    /// As [`RunConfig::resolve`].
+    pub fn from_text(preset: &str, text: &str) -> Result<Resolved> {
+        Self::from_table(preset, parse(preset, text)?)
+    }
+
+    fn from_table(preset: &str, table: Table) -> Result<Resolved> {
+        let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
+        let config: Self = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
+            Error::Config(e.to_string().trim().replace('\n', " "))
+        })?;
+        config.validate()?;
+        Ok(Resolved { preset: preset.to_owned(), config, text })
+    }
+
+    fn validate(&self) -> Result<()> {
+        let mut problems = vec![];
+        let mut check = |ok: bool, text: String| {
+            if !ok {
+                problems.push(text);
+            }
+        };
+        let l = &self.closed_loop;
+        check(l.demonstrations > 0, "loop.demonstrations: expected at least 1, got 0".to_owned());
+        check(l.loops > 0, "loop.loops: expected at least 1, got 0".to_owned());
+        check(
+            (0.0..=1.0).contains(&l.base_share),
+            format!("loop.base_share: expected 0 to 1, got {}", l.base_share),
+        );
+        check(self.evaluation.trials > 0, "evaluation.trials: expected at least 1, got 0".to_owned());
+        check(self.evaluation.parallel > 0, "evaluation.parallel: expected at least 1, got 0".to_owned());
+        check(self.train.save_every > 0, "train.save_every: expected at least 1, got 0".to_owned());
+        check(
+            self.policy.cameras.is_empty() || self.env.cameras,
+            "env.cameras: expected true for a policy with cameras, got false".to_owned(),
+        );
+        check(
+            self.policy.cameras.is_empty() || self.policy.image_size == self.env.image_size,
+            format!(
+                "policy.image_size: expected env.image_size ({}), got {}",
+                self.env.image_size, self.policy.image_size
+            ),
+        );
+        if let Err(e) = self.policy.validate() {
+            problems.push(e.to_string());
+        }
+        if problems.is_empty() { Ok(()) } else { Err(Error::Config(problems.join("; "))) }
+    }
+}
+
+fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str> {
+    known.iter().find(|(n, _)| *n == name).map(|(_, text)| *text).ok_or_else(|| {
+        let nearest = nearest(name, known.iter().map(|(n, _)| *n)).unwrap_or_default();
+        Error::Config(format!("unknown {what} `{name}`; did you mean `{nearest}`?"))
+    })
+}
+
+fn parse(name: &str, text: &str) -> Result<Table> {
+    text.parse::<Table>().map_err(|e| Error::Config(format!("{name}: {}", e.message())))
+}
+
+/// Lays `over` onto `base`; a key that `base` does not have is unknown, because presets state every entry.
+fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
+    for (key, value) in over {
+        let full = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+        let Some(slot) = base.get_mut(key) else {
+            let candidates: Vec<&str> = base.keys().map(String::as_str).collect();
+            let nearest = nearest(key, candidates.into_iter()).unwrap_or_default();
+            let prefix = if path.is_empty() { String::new() } else { format!("{path}.") };
+            return Err(Error::Config(format!("unknown key `{full}`; did you mean `{prefix}{nearest}`?")));
+        };
+        match (slot, value) {
+            (Value::Table(slot), Value::Table(value)) => merge(slot, value, &full)?,
+            (slot @ Value::Float(_), Value::Integer(i)) => *slot = Value::Float(*i as f64),
+            (slot, value) if slot.type_str() == value.type_str() => *slot = value.clone(),
+            (slot, value) => {
+                return Err(Error::Config(format!(
+                    "key `{full}`: expected a value of type {}, got {value} ({})",
+                    slot.type_str(),
+                    value.type_str()
+                )));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The candidate with the fewest edits from `name`.
+fn nearest<'a>(name: &str, candidates: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    candidates.min_by_key(|c| edits(name, c))
+}
+
+fn edits(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.chars().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, y) in b.iter().enumerate() {
+            let replaced = diagonal + usize::from(x != *y);
+            diagonal = row[j + 1];
+            row[j + 1] = replaced.min(row[j] + 1).min(diagonal + 1);
+        }
+    }
+    row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn keys(table: &Table, path: &str, out: &mut Vec<String>) {
+        for (k, v) in table {
+            match v {
+                Value::Table(t) => keys(t, &format!("{path}{k}."), out),
+                _ => out.push(format!("{path}{k}")),
+            }
+        }
+    }
+
+    #[test]
+    fn every_preset_states_every_key_and_resolves_for_every_task() {
+        let mut all = vec![];
+        for (name, text) in PRESETS {
+            let mut found = vec![];
+            keys(&parse(name, text).unwrap(), "", &mut found);
+            found.sort();
+            all.push(found);
+            for (task, _) in TASKS {
+                let resolved = RunConfig::resolve(name, task, &[]).unwrap();
+                let again = RunConfig::from_text(name, &resolved.text).unwrap();
+                assert_eq!(resolved.config, again.config);
+            }
+        }
+        assert!(all.windows(2).all(|w| w[0] == w[1]), "presets differ in their keys");
+    }
+
+    #[test]
+    fn overrides_win_and_keep_types() {
+        let set = ["loop.cycles=7".to_owned(), "train.step.adam.lr = 1".to_owned(), "task.variant=square".to_owned()];
+        let r = RunConfig::resolve("smoke", "nut_assembly", &set).unwrap().config;
+        assert_eq!(r.closed_loop.cycles, 7);
+        assert!((r.train.step.adam.lr - 1.0).abs() < 1e-9);
+        assert_eq!(r.task.variant, "square");
+    }
+
+    #[test]
+    fn unknown_names_are_answered_with_the_nearest() {
+        let text = |r: Result<Resolved>| r.unwrap_err().to_string();
+        assert!(text(RunConfig::resolve("lapto", "nut_assembly", &[])).contains("did you mean `laptop`"));
+        assert!(text(RunConfig::resolve("smoke", "nut_asembly", &[])).contains("did you mean `nut_assembly`"));
+        let set = |s: &str| text(RunConfig::resolve("smoke", "nut_assembly", &[s.to_owned()]));
+        assert!(set("loop.cycle=3").contains("did you mean `loop.cycles`"));
+        assert!(set("loop.cycles=many").contains("expected a value of type integer"));
+        assert!(set("loop.cycles").contains("expected key=value"));
+        assert!(set("policy.horizon=15").contains("horizon"));
+    }
+}

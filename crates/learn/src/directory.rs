@@ -1,0 +1,149 @@
+//! The run directory: what is in it, and how it is written so that a kill at any instant leaves it usable.
+
+use crate::config::Resolved;
+use crate::{Error, Result};
+use e2h_core::Episode;
+use e2h_data::EpisodeStore;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Layout version of a run directory.
+const FORMAT: u32 = 1;
+
+/// What a run is; written once, compared on resume.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Identity {
+    format: u32,
+    task: String,
+    preset: String,
+    seed: u64,
+}
+
+/// A run directory that is this run's own.
+#[derive(Debug, Clone)]
+pub(crate) struct Directory {
+    path: PathBuf,
+}
+
+pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
+    let path = path.to_owned();
+    move |source| Error::Io { doing, path, source }
+}
+
+/// Writes beside the place, syncs, renames; makes the folder when it is not there.
+pub(crate) fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
+    let dir = path.parent().unwrap_or(Path::new("."));
+    std::fs::create_dir_all(dir).map_err(io("creating", dir))?;
+    Ok(crate::report::write_atomic(path, bytes)?)
+}
+
+fn sync(dir: &Path) -> Result<()> {
+    std::fs::File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
+}
+
+impl Directory {
+    /// Makes a new run directory, or goes on with one of the same run.
+    pub(crate) fn open(path: &Path, resume: bool, task: &str, seed: u64, resolved: &Resolved) -> Result<Self> {
+        let this = Self { path: path.to_owned() };
+        let identity =
+            Identity { format: FORMAT, task: task.to_owned(), preset: resolved.preset.clone(), seed };
+        let file = path.join("run.json");
+        if !file.exists() {
+            // A folder without run.json is a run that was killed at its first instant, or somebody else's.
+            let foreign = path.exists()
+                && std::fs::read_dir(path)
+                    .map_err(io("reading", path))?
+                    .flatten()
+                    .any(|e| e.file_name() != "config.toml" && !e.file_name().to_string_lossy().starts_with(".tmp"));
+            if foreign {
+                return Err(Error::Exists(path.to_owned()));
+            }
+            write_atomic(&path.join("config.toml"), resolved.text.as_bytes())?;
+            this.put("run.json", &identity)?;
+            return Ok(this);
+        }
+        if !resume {
+            return Err(Error::Exists(path.to_owned()));
+        }
+        let found: Identity = this.get("run.json")?.unwrap_or_else(|| identity.clone());
+        let differs = |quantity: &str, expected: String, found: String| {
+            Err(Error::Foreign { path: path.to_owned(), quantity: quantity.to_owned(), expected, found })
+        };
+        if found.format != FORMAT {
+            return differs("layout version", FORMAT.to_string(), found.format.to_string());
+        }
+        if found != identity {
+            let text = |i: &Identity| format!("{} {} seed {}", i.task, i.preset, i.seed);
+            return differs("run", text(&identity), text(&found));
+        }
+        let config = path.join("config.toml");
+        let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;
+        if text != resolved.text {
+            let line = resolved.text.lines().zip(text.lines()).find(|(a, b)| a != b);
+            let (expected, found) = line.unwrap_or(("the configuration given", "another one"));
+            return differs("config.toml", expected.to_owned(), found.to_owned());
+        }
+        Ok(this)
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(crate) fn join(&self, name: impl AsRef<Path>) -> PathBuf {
+        self.path.join(name)
+    }
+
+    /// Writes `value` as JSON.
+    pub(crate) fn put<T: Serialize>(&self, name: &str, value: &T) -> Result<()> {
+        let path = self.join(name);
+        let text = serde_json::to_string_pretty(value).map_err(|e| Error::Foreign {
+            path: path.clone(),
+            quantity: "value".to_owned(),
+            expected: "JSON".to_owned(),
+            found: e.to_string(),
+        })?;
+        write_atomic(&path, format!("{text}\n").as_bytes())
+    }
+
+    /// Reads JSON; none when the file is not there.
+    pub(crate) fn get<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>> {
+        let path = self.join(name);
+        let text = match std::fs::read_to_string(&path) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(e) => return Err(io("reading", &path)(e)),
+        };
+        serde_json::from_str(&text).map(Some).map_err(|e| Error::Foreign {
+            path,
+            quantity: "file".to_owned(),
+            expected: "one that this run wrote".to_owned(),
+            found: e.to_string(),
+        })
+    }
+
+    /// Writes a folder of episodes and a JSON file in it; the folder appears whole or not at all.
+    pub(crate) fn put_episodes<T: Serialize>(&self, name: &str, episodes: &[Episode], notes: &T) -> Result<()> {
+        let beside_name = format!("{name}.unfinished");
+        let (beside, place) = (self.join(&beside_name), self.join(name));
+        if beside.exists() {
+            std::fs::remove_dir_all(&beside).map_err(io("removing", &beside))?;
+        }
+        let store = EpisodeStore::open(&beside)?;
+        for (i, episode) in episodes.iter().enumerate() {
+            store.write(&format!("{i:05}"), episode)?;
+        }
+        self.put(&format!("{beside_name}/notes.json"), notes)?;
+        std::fs::rename(&beside, &place).map_err(io("renaming to", &place))?;
+        sync(place.parent().unwrap_or(Path::new(".")))
+    }
+
+    /// Reads what [`Directory::put_episodes`] wrote; none when it is not there.
+    pub(crate) fn get_episodes<T: DeserializeOwned>(&self, name: &str) -> Result<Option<(Vec<Episode>, T)>> {
+        let Some(notes) = self.get(&format!("{name}/notes.json"))? else { return Ok(None) };
+        let store = EpisodeStore::open(&self.join(name))?;
+        let episodes = store.names()?.iter().map(|n| store.read(n)).collect::<std::result::Result<_, _>>()?;
+        Ok(Some((episodes, notes)))
+    }
+}

@@ -1,0 +1,62 @@
+use std::path::PathBuf;
+
+/// What can stop a run. Nothing already made is lost: files are written beside their place and renamed.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A configuration that cannot work.
+    #[error("configuration: {0}")]
+    Config(String),
+    /// The run directory is there already.
+    #[error("{0} exists: give --resume to go on with it, or --out another folder")]
+    Exists(PathBuf),
+    /// The run directory belongs to another run.
+    #[error("{path}: {quantity}: expected {expected}, found {found}")]
+    Foreign {
+        /// The run directory or file.
+        path: PathBuf,
+        /// What differs.
+        quantity: String,
+        /// What this run needs.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
+    /// This build cannot do what was asked.
+    #[error("{0}")]
+    Unsupported(String),
+    /// A demonstrator could not do its task.
+    #[error("{0}")]
+    Demonstrations(String),
+    /// Reading or writing failed.
+    #[error("{doing} {path}: {source}")]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// File or folder.
+        path: PathBuf,
+        /// The system's answer.
+        source: std::io::Error,
+    },
+    /// The simulation failed.
+    #[error(transparent)]
+    Env(#[from] e2h_env::Error),
+    /// A policy or critic failed.
+    #[error(transparent)]
+    Policy(#[from] e2h_policy::Error),
+    /// Episodes on disk, windows or normaliser failed.
+    #[error(transparent)]
+    Data(#[from] e2h_data::Error),
+    /// Refinement failed.
+    #[error(transparent)]
+    Refine(#[from] e2h_refine::Error),
+    /// An episode does not hold together.
+    #[error(transparent)]
+    Core(#[from] e2h_core::Error),
+    /// The report could not be made.
+    #[error(transparent)]
+    Report(#[from] crate::report::Error),
+}
+
+/// Shorthand for a result with this crate's [`enum@Error`].
+pub type Result<T> = std::result::Result<T, Error>;

@@ -1,0 +1,55 @@
+//! A checkpoint and the environment that it was trained in.
+
+use crate::config::RunConfig;
+use crate::{Error, Result};
+use e2h_core::Direction;
+use e2h_env::Env;
+use e2h_policy::{Checkpoint, DiffusionPolicy};
+use std::path::Path;
+
+/// A policy with everything that an evaluation needs.
+pub struct Published {
+    /// The policy.
+    pub policy: DiffusionPolicy,
+    /// Its configuration, normaliser and provenance.
+    pub checkpoint: Checkpoint,
+    /// Configuration of the run that trained it.
+    pub config: RunConfig,
+    /// Which task of the pair it does.
+    pub direction: Direction,
+    env: Env,
+}
+
+impl Published {
+    /// Reads a checkpoint folder and builds its environment.
+    ///
+    /// # Errors
+    /// When a file is missing, foreign, or of another version; names what was expected and found.
+    pub fn open(dir: &Path) -> Result<Self> {
+        let (policy, checkpoint) = DiffusionPolicy::load(dir)?;
+        let foreign = |quantity: &str, expected: &str, found: String| Error::Foreign {
+            path: dir.to_owned(),
+            quantity: quantity.to_owned(),
+            expected: expected.to_owned(),
+            found,
+        };
+        let config: RunConfig = serde_json::from_value(checkpoint.provenance.run.clone())
+            .map_err(|e| foreign("run configuration", "one of this version", e.to_string()))?;
+        let direction = match checkpoint.provenance.direction.as_str() {
+            "hard" => Direction::Hard,
+            "easy" => Direction::Easy,
+            other => return Err(foreign("direction", "hard or easy", other.to_owned())),
+        };
+        let task = e2h_env::task(&config.task.name, &config.task.options())?;
+        let env = Env::new(task, &config.env)?;
+        Ok(Self { policy, checkpoint, config, direction, env })
+    }
+
+    /// `n` simulations of its task.
+    ///
+    /// # Errors
+    /// When the simulation cannot be set up.
+    pub fn envs(&self, n: usize) -> Result<Vec<Env>> {
+        (0..n).map(|_| Ok(self.env.clone_shared()?)).collect()
+    }
+}

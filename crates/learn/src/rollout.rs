@@ -1,0 +1,125 @@
+//! Rollouts of several simulations side by side, with one batched policy call for all of them.
+//!
+//! Every simulation is a lane. Lanes execute their action chunks in parallel; between chunks the policies answer all lanes
+//! that wait for them in lane order. Which lane does what is decided by its own state alone, so neither the number of
+//! threads nor their timing can change a result.
+
+use crate::Result;
+use e2h_core::{Action, Direction, Episode, Observation, Origin, Outcome, Policy, Rng};
+use e2h_env::Env;
+use rayon::prelude::*;
+use std::collections::VecDeque;
+
+/// One episode in progress in one simulation.
+pub(crate) struct Rollout {
+    pub(crate) direction: Direction,
+    rng: Rng,
+    history: VecDeque<Observation>,
+    /// None: frames are rendered only where the policy looks (evaluation).
+    episode: Option<Episode>,
+    steps: usize,
+}
+
+/// What a rollout left.
+pub(crate) struct Finished {
+    pub(crate) outcome: Outcome,
+    pub(crate) steps: usize,
+    pub(crate) episode: Option<Episode>,
+}
+
+impl Rollout {
+    /// Starts an episode from the current physical state of `env`; `record` keeps every observation.
+    pub(crate) fn begin(
+        env: &mut Env,
+        direction: Direction,
+        n_obs_steps: usize,
+        rng: Rng,
+        record: Option<Origin>,
+    ) -> Result<Self> {
+        env.begin(direction)?;
+        let first = env.observe()?;
+        let history = std::iter::repeat_n(first, n_obs_steps).collect();
+        let episode = record.map(|origin| Episode::new(origin, env.cameras()));
+        Ok(Self { direction, rng, history, episode, steps: 0 })
+    }
+
+    /// Executes `chunk`; Some when the episode ended in it.
+    pub(crate) fn execute(&mut self, env: &mut Env, chunk: &[Action]) -> Result<Option<Finished>> {
+        for (i, action) in chunk.iter().enumerate() {
+            if let (Some(episode), Some(now)) = (&mut self.episode, self.history.back()) {
+                episode.push(now, action)?;
+            }
+            let end = env.step(action)?;
+            self.steps += 1;
+            if let Some(outcome) = end {
+                let episode = self.episode.take().map(|mut episode| {
+                    episode.outcome = outcome;
+                    episode
+                });
+                return Ok(Some(Finished { outcome, steps: self.steps, episode }));
+            }
+            // Without a recording only the observations that the next policy call gets are worth rendering.
+            if self.episode.is_some() || i + self.history.len() >= chunk.len() {
+                self.history.pop_front();
+                self.history.push_back(env.observe()?);
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// One simulation and what it is doing.
+pub(crate) struct Lane<S> {
+    pub(crate) env: Env,
+    pub(crate) rollout: Option<Rollout>,
+    /// The driver's own bookkeeping.
+    pub(crate) state: S,
+}
+
+/// Runs all lanes until none has a rollout. `next` is called with a lane whose rollout just ended (what it left, and which
+/// task it did) and starts its next one, if there is to be one; it runs on the lane's own thread. `tick` hears how many lanes still run.
+pub(crate) fn drive<S: Send>(
+    lanes: &mut [Lane<S>],
+    hard: &dyn Policy,
+    easy: &dyn Policy,
+    next: &(dyn Fn(&mut Lane<S>, Finished, Direction) -> Result<()> + Sync),
+    mut tick: impl FnMut(&[Lane<S>]),
+) -> Result<()> {
+    loop {
+        let mut waiting: Vec<&mut Lane<S>> = lanes.iter_mut().filter(|l| l.rollout.is_some()).collect();
+        if waiting.is_empty() {
+            return Ok(());
+        }
+        let mut chunks: Vec<Vec<Action>> = vec![vec![]; waiting.len()];
+        for (direction, policy) in [(Direction::Hard, hard), (Direction::Easy, easy)] {
+            let (mut index, mut histories, mut rngs) = (vec![], vec![], vec![]);
+            for (i, lane) in waiting.iter().enumerate() {
+                if let Some(r) = lane.rollout.as_ref().filter(|r| r.direction == direction) {
+                    index.push(i);
+                    histories.push(r.history.iter().collect::<Vec<_>>());
+                    rngs.push(r.rng.clone());
+                }
+            }
+            if index.is_empty() {
+                continue;
+            }
+            let actions = policy.act(&histories, &mut rngs)?;
+            for ((i, chunk), rng) in index.into_iter().zip(actions).zip(rngs) {
+                chunks[i] = chunk;
+                if let Some(r) = &mut waiting[i].rollout {
+                    r.rng = rng;
+                }
+            }
+        }
+        waiting.par_iter_mut().zip(chunks).try_for_each(|(lane, chunk)| -> Result<()> {
+            let Some(rollout) = &mut lane.rollout else { return Ok(()) };
+            if let Some(finished) = rollout.execute(&mut lane.env, &chunk)? {
+                let direction = rollout.direction;
+                lane.rollout = None;
+                next(lane, finished, direction)?;
+            }
+            Ok(())
+        })?;
+        tick(lanes);
+    }
+}

@@ -1,0 +1,604 @@
+//! A run: its directory, its stages, and how it goes on after a kill.
+//!
+//! Every stage is a function of the configuration, the seed and what earlier stages left, and its result is written whole or
+//! not at all. Resuming is calling the same stages again: a stage whose result is there reads it.
+
+use crate::collect::{Collected, collect};
+use crate::config::{Resolved, RunConfig};
+use crate::directory::{Directory, write_atomic};
+use crate::evaluate::{evaluate, film};
+use crate::picture;
+use crate::record::{Collection, IterationRecord, RunResults};
+use crate::report;
+use crate::{Error, Progress, Result};
+use e2h_core::{Direction, Episode, Kind, Origin, stream};
+use e2h_data::{Normaliser, NormaliserConfig};
+use e2h_env::{Env, Task, demonstrate};
+use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData, train_critic};
+use e2h_refine::{Refined, critic_filter, gate, kinematic_filter, reverse};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// What a run is started with.
+#[derive(Debug, Clone)]
+pub struct RunOptions {
+    /// Task pair.
+    pub task: String,
+    /// Preset name.
+    pub preset: String,
+    /// Seed of everything random.
+    pub seed: u64,
+    /// `key.path=value` overrides.
+    pub set: Vec<String>,
+    /// The run directory; by default `runs/<task>-<preset>-<seed>`.
+    pub out: Option<PathBuf>,
+    /// Go on with a run directory that exists.
+    pub resume: bool,
+    /// Threads; by default as many as there are cores. Never changes a result.
+    pub threads: Option<usize>,
+    /// Show no progress.
+    pub quiet: bool,
+}
+
+/// A run in progress.
+pub struct Run {
+    options: RunOptions,
+    resolved: Resolved,
+    dir: Directory,
+    progress: Progress,
+    task: Arc<dyn Task>,
+    env: Env,
+}
+
+/// Demonstrations and what is fitted on them.
+pub struct Base {
+    /// Easy demonstrations as recorded.
+    pub easy: Vec<Episode>,
+    /// `D_e^(0)`: what the easy policy learns from.
+    pub easy_training: Vec<Arc<Episode>>,
+    /// `D_h^(0)`: the reversed demonstrations.
+    pub hard_training: Vec<Arc<Episode>>,
+    /// Scaling, fitted on `D_h^(0)`.
+    pub normaliser: Normaliser,
+}
+
+/// Easy rollouts of one iteration, refined.
+pub struct Accepted {
+    /// Segments for training.
+    pub segments: Vec<Arc<Episode>>,
+    /// What collection brought and what refinement made of it.
+    pub collection: Collection,
+}
+
+#[derive(Serialize, Deserialize)]
+struct AcceptedNotes {
+    collection: Collection,
+    stage_minutes: BTreeMap<String, f64>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct TrainNotes {
+    minutes: f64,
+    loss: f64,
+}
+
+impl Run {
+    /// Checks everything that can be checked before any work, then makes or opens the run directory.
+    ///
+    /// # Errors
+    /// A configuration that cannot work, an unknown task, a run directory that exists (without `resume`) or is another
+    /// run's.
+    pub fn open(options: &RunOptions) -> Result<Self> {
+        e2h_nn::tune_allocator();
+        let resolved = RunConfig::resolve(&options.preset, &options.task, &options.set)?;
+        if let Some(n) = options.threads {
+            set_threads(n)?;
+        }
+        let config = &resolved.config;
+        let task = e2h_env::task(&config.task.name, &config.task.options())?;
+        let env = Env::new(task.clone(), &config.env)?;
+        let path = options.out.clone().unwrap_or_else(|| {
+            PathBuf::from(format!("runs/{}-{}-{}", options.task, options.preset, options.seed))
+        });
+        let dir = Directory::open(&path, options.resume, &options.task, options.seed, &resolved)?;
+        let progress = Progress::new(options.quiet);
+        Ok(Self { options: options.clone(), resolved, dir, progress, task, env })
+    }
+
+    /// The resolved configuration.
+    #[must_use]
+    pub fn config(&self) -> &RunConfig {
+        &self.resolved.config
+    }
+
+    /// The run directory.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        self.dir.path()
+    }
+
+    /// Updates of the hard policy.
+    #[must_use]
+    pub fn iterations(&self) -> u32 {
+        self.config().closed_loop.iterations
+    }
+
+    fn envs(&self, n: usize) -> Result<Vec<Env>> {
+        (0..n).map(|_| Ok(self.env.clone_shared()?)).collect()
+    }
+
+    fn origin(&self, iteration: u32) -> Origin {
+        Origin {
+            task: self.options.task.clone(),
+            direction: Direction::Easy,
+            kind: Kind::Rollout,
+            iteration,
+            episode: 0,
+            seed: self.options.seed,
+            reversed: false,
+        }
+    }
+
+    /// Records the easy demonstrations and reverses them into `D_h^(0)`.
+    ///
+    /// # Errors
+    /// When the demonstrator fails more often than it succeeds, or the folder cannot be written.
+    pub fn demonstrations(&self) -> Result<Base> {
+        let c = self.config();
+        let easy = match self.dir.get_episodes::<BTreeMap<String, f64>>("demonstrations")? {
+            Some((episodes, _)) => episodes,
+            None => {
+                let start = Instant::now();
+                let wanted = c.closed_loop.demonstrations;
+                let bar = self.progress.bar("easy demonstrations", wanted as u64);
+                let mut env = self.env.clone_shared()?;
+                let mut episodes = Vec::with_capacity(wanted);
+                let mut failed = 0;
+                let mut index = 0;
+                while episodes.len() < wanted {
+                    let origin =
+                        Origin::demonstration(&self.options.task, Direction::Easy, index, self.options.seed);
+                    let mut rng = stream(self.options.seed, "demonstrate", 0, u64::from(index));
+                    let episode =
+                        demonstrate(&mut env, Direction::Easy, &c.task.demonstrator, origin, &mut rng)?;
+                    index += 1;
+                    if episode.outcome.is_success() {
+                        episodes.push(episode);
+                    } else {
+                        failed += 1;
+                        if failed > wanted {
+                            return Err(Error::Demonstrations(format!(
+                                "the scripted demonstrator failed {failed} times for {} successes",
+                                episodes.len()
+                            )));
+                        }
+                    }
+                    bar.set(episodes.len() as u64, &format!("{failed} failed"));
+                }
+                bar.finish(&format!("{wanted} recorded, {failed} failed"));
+                let minutes = start.elapsed().as_secs_f64() / 60.0;
+                let notes = BTreeMap::from([("minutes".to_owned(), minutes)]);
+                self.dir.put_episodes("demonstrations", &episodes, &notes)?;
+                episodes
+            }
+        };
+        let r = &c.refine;
+        let filtered = |episode: Episode, filter: bool| -> Vec<Episode> {
+            if filter { kinematic_filter(&episode, &r.kinematic, &r.reverse).segments } else { vec![episode] }
+        };
+        let hard: Vec<Episode> = easy
+            .iter()
+            .flat_map(|e| filtered(reverse(e, &r.reverse), c.closed_loop.refine_demonstrations))
+            .collect();
+        let easy_training: Vec<Episode> = easy
+            .iter()
+            .flat_map(|e| filtered(e.clone(), c.closed_loop.refine_easy_demonstrations))
+            .collect();
+        let config = NormaliserConfig { margin: c.train.normaliser_margin, ..NormaliserConfig::default() };
+        let normaliser = Normaliser::fit(&hard, &config)?;
+        Ok(Base {
+            easy_training: easy_training.into_iter().map(Arc::new).collect(),
+            hard_training: hard.into_iter().map(Arc::new).collect(),
+            easy,
+            normaliser,
+        })
+    }
+
+    /// Trains the easy policy, once.
+    ///
+    /// # Errors
+    /// When training diverges or the folder cannot be written.
+    pub fn train_easy(&self, base: &Base) -> Result<DiffusionPolicy> {
+        let steps = self.config().train.easy_steps;
+        let data = (&base.easy_training[..], &[][..]);
+        self.train("policy_easy", "train easy", Direction::Easy, 0, steps, base, data, None)
+    }
+
+    /// Trains the initial hard policy on `D_h^(0)`.
+    ///
+    /// # Errors
+    /// As [`Run::train_easy`].
+    pub fn train_initial(&self, base: &Base) -> Result<DiffusionPolicy> {
+        let steps = self.config().train.initial_steps;
+        let data = (&base.hard_training[..], &[][..]);
+        self.train(&folder(0, "policy"), "train hard 0", Direction::Hard, 0, steps, base, data, None)
+    }
+
+    /// Continues the hard policy on `D_h^(0)` and the accepted segments; with none it stays as it is.
+    ///
+    /// # Errors
+    /// As [`Run::train_easy`].
+    pub fn update(
+        &self,
+        iteration: u32,
+        policy: &DiffusionPolicy,
+        base: &Base,
+        accepted: &[Arc<Episode>],
+    ) -> Result<DiffusionPolicy> {
+        let steps = if accepted.is_empty() { 0 } else { self.config().train.update_steps };
+        let data = (&base.hard_training[..], accepted);
+        let name = format!("train hard {iteration}");
+        self.train(&folder(iteration, "policy"), &name, Direction::Hard, iteration, steps, base, data, Some(policy))
+    }
+
+    #[allow(clippy::too_many_arguments, reason = "one private place where all that differs between stages meets")]
+    fn train(
+        &self,
+        place: &str,
+        name: &str,
+        direction: Direction,
+        iteration: u32,
+        steps: usize,
+        base: &Base,
+        data: (&[Arc<Episode>], &[Arc<Episode>]),
+        start: Option<&DiffusionPolicy>,
+    ) -> Result<DiffusionPolicy> {
+        let c = self.config();
+        let notes_file = format!("{place}/notes.json");
+        if self.dir.get::<TrainNotes>(&notes_file)?.is_some() {
+            return Ok(DiffusionPolicy::load(&self.dir.join(place))?.0);
+        }
+        let clock = Instant::now();
+        let share = c.closed_loop.base_share;
+        let data = TrainingData::new(data.0, data.1, share, &c.policy, &base.normaliser)?;
+        let weights = start.map(DiffusionPolicy::weights).transpose()?;
+        let purpose = format!("train/{direction}/{iteration}");
+        let mut trainer = Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?;
+        let saved = self.dir.join(format!("{place}/training.safetensors"));
+        if saved.exists() {
+            trainer.restore(&saved)?;
+        }
+        let bar = self.progress.bar(name, steps as u64);
+        let mut recent = std::collections::VecDeque::with_capacity(100);
+        let mean = |recent: &std::collections::VecDeque<f32>| {
+            recent.iter().map(|&l| f64::from(l)).sum::<f64>() / recent.len().max(1) as f64
+        };
+        while trainer.step_count() < steps {
+            let loss = trainer.step(&data)?;
+            if recent.len() == 100 {
+                recent.pop_front();
+            }
+            recent.push_back(loss);
+            let done = trainer.step_count();
+            if done % 10 == 0 {
+                bar.set(done as u64, &format!("loss {:.4}", mean(&recent)));
+            }
+            // Not in the last hundred steps, so that the mean loss of a resumed run is of as many steps as ever.
+            if done % c.train.save_every == 0 && done + 100 <= steps {
+                std::fs::create_dir_all(self.dir.join(place))
+                    .map_err(crate::directory::io("creating", &self.dir.join(place)))?;
+                trainer.save(&saved)?;
+            }
+        }
+        let loss = mean(&recent);
+        bar.finish(&format!("{steps} steps, loss {loss:.4}"));
+        let weights = match (steps, weights) {
+            (0, Some(weights)) => weights,
+            _ => trainer.weights()?,
+        };
+        let policy = DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?;
+        policy.save(&self.dir.join(place), &self.provenance(direction, iteration)?)?;
+        let minutes = clock.elapsed().as_secs_f64() / 60.0;
+        self.dir.put(&notes_file, &TrainNotes { minutes, loss })?;
+        if saved.exists() {
+            std::fs::remove_file(&saved).map_err(crate::directory::io("removing", &saved))?;
+        }
+        Ok(policy)
+    }
+
+    fn provenance(&self, direction: Direction, iteration: u32) -> Result<Provenance> {
+        let run = serde_json::to_value(self.config()).map_err(|e| Error::Config(e.to_string()))?;
+        Ok(Provenance {
+            task: self.options.task.clone(),
+            direction: direction.to_string(),
+            preset: self.options.preset.clone(),
+            seed: self.options.seed,
+            iteration,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            run,
+        })
+    }
+
+    /// What an earlier process of this run accepted in `iteration`, if it got that far.
+    ///
+    /// # Errors
+    /// When the folder cannot be read.
+    pub fn stored(&self, iteration: u32) -> Result<Option<Accepted>> {
+        let found = self.dir.get_episodes::<AcceptedNotes>(&folder(iteration, "segments"))?;
+        Ok(found.map(|(segments, notes)| Accepted {
+            segments: segments.into_iter().map(Arc::new).collect(),
+            collection: notes.collection,
+        }))
+    }
+
+    /// What the update of `iteration` learns from besides `D_h^(0)`: this iteration's segments, with all earlier ones where
+    /// the configuration accumulates.
+    ///
+    /// # Errors
+    /// When an earlier iteration's folder cannot be read.
+    pub fn training_set(&self, iteration: u32, accepted: &Accepted) -> Result<Vec<Arc<Episode>>> {
+        let mut all = vec![];
+        if self.config().closed_loop.accumulate {
+            for earlier in 1..iteration {
+                all.extend(self.stored(earlier)?.map(|a| a.segments).unwrap_or_default());
+            }
+        }
+        all.extend(accepted.segments.iter().cloned());
+        Ok(all)
+    }
+
+    /// Closed-loop collection with both policies.
+    ///
+    /// # Errors
+    /// When the simulation fails.
+    pub fn collect(&self, iteration: u32, hard: &DiffusionPolicy, easy: &DiffusionPolicy) -> Result<Collected> {
+        let c = &self.config().closed_loop;
+        collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)
+    }
+
+    /// Reverses and refines the easy rollouts of one iteration, with a critic trained on its hard rollouts.
+    ///
+    /// # Errors
+    /// When the critic's training diverges or the folder cannot be written.
+    pub fn refine(
+        &self,
+        iteration: u32,
+        collected: Collected,
+        collect_time: Duration,
+        base: &Base,
+        policy: &DiffusionPolicy,
+    ) -> Result<Accepted> {
+        let c = self.config();
+        let r = &c.refine;
+        let clock = Instant::now();
+        let mut notes = vec![];
+        let reversed: Vec<Episode> = collected.easy.iter().map(|e| reverse(e, &r.reverse)).collect();
+        let candidates: Vec<Episode> = reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
+        let kinematic: Vec<Refined> = candidates
+            .iter()
+            .map(|e| {
+                if r.kinematic_enabled {
+                    kinematic_filter(e, &r.kinematic, &r.reverse)
+                } else {
+                    Refined::untouched(e)
+                }
+            })
+            .collect();
+        let refine_minutes = clock.elapsed().as_secs_f64() / 60.0;
+
+        let clock = Instant::now();
+        let successes = collected.hard.iter().filter(|e| e.outcome.is_success()).count();
+        let mut critic_loss = None;
+        let refined = if !c.critic.enabled {
+            notes.push("critic: switched off".to_owned());
+            kinematic
+        } else if successes == 0 {
+            notes.push("critic: skipped, no hard rollout succeeded".to_owned());
+            kinematic
+        } else if candidates.is_empty() {
+            notes.push("critic: skipped, nothing to filter".to_owned());
+            kinematic
+        } else {
+            let name = format!("critic {iteration}");
+            let network = &c.critic.network;
+            let bar = self.progress.bar(&name, network.steps as u64);
+            let (critic, report) = train_critic(
+                &c.policy,
+                network,
+                &base.normaliser,
+                &policy.weights()?,
+                &collected.hard,
+                c.env.horizon_hard,
+                self.options.seed,
+                &format!("critic/{iteration}"),
+                |step, loss| bar.set(step as u64, &format!("loss {loss:.4}")),
+            )?;
+            bar.finish(&format!(
+                "loss {:.4}, held out {:.4}",
+                report.train_loss,
+                report.validation_loss.unwrap_or(f64::NAN)
+            ));
+            critic_loss = report.validation_loss.or(Some(report.train_loss));
+            let values = kinematic
+                .iter()
+                .flat_map(|k| &k.segments)
+                .map(|segment| critic.evaluate(segment))
+                .collect::<std::result::Result<Vec<_>, _>>()?;
+            critic_filter(kinematic, &values, &r.suffix, &r.advantage)?
+        };
+        let critic_minutes = clock.elapsed().as_secs_f64() / 60.0;
+
+        let mut fates = BTreeMap::new();
+        for fate in refined.iter().flat_map(|r| &r.fates) {
+            *fates.entry(picture::fate_name(*fate).to_owned()).or_default() += 1;
+        }
+        if let Some((episode, refined)) = candidates.iter().zip(&refined).next() {
+            let svg = picture::filter(episode, refined, &r.kinematic)?;
+            write_atomic(&self.dir.join(folder(iteration, "filter.svg")), svg.as_bytes())?;
+        }
+        let segments: Vec<Episode> =
+            refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty()).collect();
+        let collection = Collection {
+            cycles: c.closed_loop.cycles,
+            hard_successes: successes,
+            easy_successes: collected.easy_successes,
+            easy_rollouts: collected.easy_rollouts,
+            resets: collected.resets,
+            accepted: candidates.len(),
+            fates,
+            segments: segments.len(),
+            frames_kept: segments.iter().map(Episode::len).sum(),
+            critic_loss,
+            notes,
+        };
+        let stage_minutes = BTreeMap::from([
+            ("collect".to_owned(), collect_time.as_secs_f64() / 60.0),
+            ("refine".to_owned(), refine_minutes),
+            ("critic".to_owned(), critic_minutes),
+        ]);
+        let stored = AcceptedNotes { collection, stage_minutes };
+        self.dir.put_episodes(&folder(iteration, "segments"), &segments, &stored)?;
+        Ok(Accepted {
+            segments: segments.into_iter().map(Arc::new).collect(),
+            collection: stored.collection,
+        })
+    }
+
+    /// Measures the hard policy and appends its row to the record.
+    ///
+    /// # Errors
+    /// When the simulation fails or the folder cannot be written.
+    pub fn evaluate(
+        &self,
+        iteration: u32,
+        policy: &DiffusionPolicy,
+        accepted: Option<&Accepted>,
+    ) -> Result<IterationRecord> {
+        let file = folder(iteration, "record.json");
+        if let Some(record) = self.dir.get(&file)? {
+            return Ok(record);
+        }
+        let c = self.config();
+        let e = &c.evaluation;
+        let envs = self.envs(e.parallel.min(e.trials))?;
+        let (evaluation, trials) = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, &self.progress)?;
+        if e.filmed > 0 {
+            let filmed: Vec<usize> = (0..e.filmed.min(trials.len())).collect();
+            let films = film(&mut self.env.clone_shared()?, policy, Direction::Hard, &filmed, e.seed, "table", 160)?;
+            let path = self.dir.join(folder(iteration, "rollouts.png"));
+            report::animation::write_apng(&path, &picture::tiles(&films, 3), 10)?;
+        }
+        let place = folder(iteration, "policy");
+        let trained: Option<TrainNotes> = self.dir.get(&format!("{place}/notes.json"))?;
+        let mut stage_minutes = BTreeMap::from([("evaluate".to_owned(), evaluation.seconds / 60.0)]);
+        stage_minutes.insert("train".to_owned(), trained.as_ref().map_or(0.0, |t| t.minutes));
+        if iteration == 0 {
+            let easy: Option<TrainNotes> = self.dir.get("policy_easy/notes.json")?;
+            stage_minutes.insert("train easy".to_owned(), easy.map_or(0.0, |t| t.minutes));
+            let recorded: Option<BTreeMap<String, f64>> = self.dir.get("demonstrations/notes.json")?;
+            let recorded = recorded.and_then(|r| r.get("minutes").copied()).unwrap_or(0.0);
+            stage_minutes.insert("demonstrations".to_owned(), recorded);
+        } else if let Some(notes) =
+            self.dir.get::<AcceptedNotes>(&folder(iteration, "segments/notes.json"))?
+        {
+            stage_minutes.extend(notes.stage_minutes);
+        }
+        let before = if iteration == 0 {
+            0.0
+        } else {
+            let previous: Option<IterationRecord> = self.dir.get(&folder(iteration - 1, "record.json"))?;
+            previous.map_or(0.0, |p| p.minutes)
+        };
+        let record = IterationRecord {
+            iteration,
+            evaluation,
+            minutes: before + stage_minutes.values().sum::<f64>(),
+            stage_minutes,
+            collection: accepted.map(|a| a.collection.clone()),
+            loss: trained.map_or(0.0, |t| t.loss),
+            skipped: accepted.is_some_and(|a| a.segments.is_empty()),
+        };
+        self.dir.put(&file, &record)?;
+        self.progress.say(&format!(
+            "iteration {iteration}: {} of {} trials, {:.1} minutes",
+            record.evaluation.successes, record.evaluation.trials, record.minutes
+        ));
+        Ok(record)
+    }
+
+    /// Writes `results.json` and `report.html`; returns the results and the report's path.
+    ///
+    /// # Errors
+    /// When the folder cannot be written.
+    pub fn report(&self, base: &Base, records: Vec<IterationRecord>) -> Result<(RunResults, PathBuf)> {
+        let c = self.config();
+        let steps: usize = base.easy.iter().map(Episode::len).sum();
+        let results = RunResults {
+            task: self.options.task.clone(),
+            variant: c.task.variant.clone(),
+            preset: self.options.preset.clone(),
+            seed: self.options.seed,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            machine: machine(),
+            iterations: records,
+            demonstration_steps: steps as f64 / base.easy.len().max(1) as f64,
+        };
+        self.dir.put("results.json", &results)?;
+        let mut pictures = report::Pictures::default();
+        let mut views = self.env.clone_shared()?;
+        for (direction, title) in [(Direction::Hard, "hard task, start"), (Direction::Easy, "easy task, start")] {
+            views.reset(direction, &mut stream(self.options.seed, "views", 0, 0))?;
+            for camera in ["table", "wrist"] {
+                let image = views.render(camera, 320, 320)?;
+                pictures.views.push((format!("{camera} camera: {title}"), report::png_bytes(&image)?));
+            }
+        }
+        for n in 0..=self.iterations() {
+            if let Ok(bytes) = std::fs::read(self.dir.join(folder(n, "rollouts.png"))) {
+                pictures.animations.push((format!("iteration {n}: rollouts at evaluation seeds"), bytes));
+            }
+            if let Ok(svg) = std::fs::read_to_string(self.dir.join(folder(n, "filter.svg"))) {
+                pictures.filter.push((format!("iteration {n}: one reversed rollout"), svg));
+            }
+        }
+        let path = report::write_report(self.dir.path(), &results, &self.resolved.text, &pictures)?;
+        Ok((results, path))
+    }
+
+    /// The task pair of the run.
+    #[must_use]
+    pub fn task(&self) -> &Arc<dyn Task> {
+        &self.task
+    }
+}
+
+/// Sets how many threads compute; never changes a result. A pool that is already running stays as it is.
+///
+/// # Errors
+/// When asked for none.
+pub fn set_threads(threads: usize) -> Result<()> {
+    if threads == 0 {
+        return Err(Error::Config("threads: expected at least 1, got 0".to_owned()));
+    }
+    drop(rayon::ThreadPoolBuilder::new().num_threads(threads).build_global());
+    Ok(())
+}
+
+fn folder(iteration: u32, name: &str) -> String {
+    format!("iteration_{iteration:02}/{name}")
+}
+
+/// Threads and the processor's name where the system tells it.
+fn machine() -> String {
+    let name = std::fs::read_to_string("/proc/cpuinfo")
+        .ok()
+        .and_then(|text| {
+            let line = text.lines().find(|l| l.starts_with("model name"))?;
+            Some(line.split_once(':')?.1.trim().to_owned())
+        })
+        .unwrap_or_else(|| std::env::consts::ARCH.to_owned());
+    format!("{name}, {} threads", rayon::current_num_threads())
+}

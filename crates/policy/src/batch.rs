@@ -1,0 +1,113 @@
+//! Host-side assembly of what the network is fed: every number passes through here once.
+
+use crate::{PolicyConfig, Result};
+use candle_core::{Device, Tensor};
+use e2h_core::{Episode, Observation, Rng, State};
+use e2h_data::Normaliser;
+use rand::Rng as _;
+
+/// Top-left corner of a crop, pixels (row, column).
+pub(crate) type Corner = (usize, usize);
+
+/// Where state rows come from.
+pub(crate) enum Rows<'a> {
+    Observations(&'a [&'a Observation]),
+    Episode(&'a Episode, &'a [usize]),
+}
+
+/// Random factors on an image: (contrast, brightness).
+pub(crate) type Jitter = (f32, f32);
+
+/// State and images of a batch, growing sample by sample.
+pub(crate) struct Host {
+    state: Vec<f32>,
+    images: Vec<Vec<f32>>,
+    samples: usize,
+    relative: bool,
+    side: usize,
+}
+
+impl Host {
+    pub(crate) fn new(config: &PolicyConfig) -> Self {
+        Self {
+            state: vec![],
+            images: vec![vec![]; if config.n_image_steps == 0 { 0 } else { config.cameras.len() }],
+            samples: 0,
+            relative: config.relative_features,
+            side: config.image_size,
+        }
+    }
+
+    /// Appends the normalised state history of one sample; `noise` is (standard deviation, stream) in training.
+    pub(crate) fn push_state(&mut self, rows: Rows<'_>, normaliser: &Normaliser, mut noise: Option<(f32, &mut Rng)>) {
+        let mut push = |state: &State| {
+            let start = self.state.len();
+            self.state.extend(normaliser.normalise_state(state));
+            if self.relative {
+                // In units of 10 cm: centred on zero and of the order of one, whatever the task's ranges are.
+                self.state.extend((0..3).map(|i| (state[7 + i] - state[i]) * 10.0));
+            }
+            if let Some((sigma, rng)) = &mut noise
+                && *sigma > 0.0
+            {
+                for v in &mut self.state[start..] {
+                    *v += *sigma * rng.sample::<f32, _>(rand_distr::StandardNormal);
+                }
+            }
+        };
+        match rows {
+            Rows::Observations(observations) => observations.iter().for_each(|o| push(&o.state)),
+            Rows::Episode(episode, rows) => rows.iter().for_each(|&r| push(&episode.state[r])),
+        }
+        self.samples += 1;
+    }
+
+    /// Appends the crop at `corner` of one (side, side, 3) image.
+    pub(crate) fn push_image(
+        &mut self,
+        camera: usize,
+        image: &[u8],
+        corner: Corner,
+        crop: usize,
+        jitter: Option<Jitter>,
+    ) {
+        let Some(column) = self.images.get_mut(camera) else { return };
+        let (contrast, brightness) = jitter.unwrap_or((1.0, 0.0));
+        // A table turns the per-pixel arithmetic into a look-up.
+        let table: [f32; 256] =
+            std::array::from_fn(|v| ((v as f32 / 255.0 - 0.5) * contrast + 0.5 + brightness).clamp(0.0, 1.0));
+        for row in 0..crop {
+            let start = ((corner.0 + row) * self.side + corner.1) * 3;
+            column.extend(image[start..start + crop * 3].iter().map(|&v| table[usize::from(v)]));
+        }
+    }
+
+    /// State (B, To * S) and one (B * steps, crop, crop, 3) tensor a camera.
+    pub(crate) fn tensors(self, crop: usize) -> Result<(Tensor, Vec<Tensor>)> {
+        let width = self.state.len() / self.samples.max(1);
+        let state = Tensor::from_vec(self.state, (self.samples, width), &Device::Cpu)?;
+        let images = self
+            .images
+            .into_iter()
+            .map(|data| {
+                let n = data.len() / (crop * crop * 3);
+                Tensor::from_vec(data, (n, crop, crop, 3), &Device::Cpu)
+            })
+            .collect::<candle_core::Result<_>>()?;
+        Ok((state, images))
+    }
+}
+
+impl PolicyConfig {
+    /// Corner of the centred crop.
+    pub(crate) fn centre_crop(&self) -> Corner {
+        let c = (self.image_size - self.crop_size) / 2;
+        (c, c)
+    }
+
+    /// Corner of a random crop.
+    pub(crate) fn random_crop(&self, rng: &mut Rng) -> Corner {
+        let room = self.image_size - self.crop_size;
+        (rng.random_range(0..=room), rng.random_range(0..=room))
+    }
+}

@@ -1,0 +1,262 @@
+use crate::{Error, Result};
+use e2h_nn::{AdamConfig, EmaConfig, LrSchedule};
+use serde::{Deserialize, Serialize};
+
+/// What the network is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Prediction {
+    /// The noise (the paper's).
+    Epsilon,
+    /// The clean actions, which learns in far fewer steps.
+    Sample,
+}
+
+/// Architecture and inference of a diffusion policy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PolicyConfig {
+    /// Observation steps, To; oldest first.
+    pub n_obs_steps: usize,
+    /// Of those, how many of the newest bring images. LeRobot: as many as `n_obs_steps`.
+    pub n_image_steps: usize,
+    /// Predicted actions, T; a multiple of `2^(levels - 1)`.
+    pub horizon: usize,
+    /// Executed actions of each prediction, Ta.
+    pub n_action_steps: usize,
+    /// True when the first predicted action belongs to the oldest observation (LeRobot) instead of the newest (the paper).
+    pub lerobot_alignment: bool,
+    /// Names of the cameras; empty for a policy from state alone.
+    pub cameras: Vec<String>,
+    /// Side of the recorded images, pixels.
+    pub image_size: usize,
+    /// Side of the crop that the encoder sees, pixels: random in training, centred otherwise.
+    pub crop_size: usize,
+    /// One encoder for all cameras instead of one each.
+    pub share_encoder: bool,
+    /// Channels of the encoder's first stage (ResNet-18: 64).
+    pub encoder_width: usize,
+    /// Blocks in each stage of the encoder (ResNet-18: 2, 2, 2, 2).
+    pub encoder_blocks: Vec<usize>,
+    /// Keypoints of the spatial softmax.
+    pub keypoints: usize,
+    /// Features of one image.
+    pub image_features: usize,
+    /// Adds the object's position relative to the tool centre point, which the U-Net would have to learn to subtract.
+    pub relative_features: bool,
+    /// Channels of the U-Net's levels.
+    pub down_dims: Vec<usize>,
+    /// Kernel of the U-Net's convolutions.
+    pub kernel_size: usize,
+    /// Groups of its normalisations.
+    pub n_groups: usize,
+    /// Width of the embedding of the diffusion step.
+    pub step_embed_dim: usize,
+    /// What the network predicts.
+    pub prediction: Prediction,
+    /// Diffusion steps in training.
+    pub train_timesteps: usize,
+    /// DDIM steps in sampling.
+    pub inference_steps: usize,
+    /// Guidance weight: 1 is fully conditional sampling; others need `conditioning_dropout` in training.
+    pub guidance: f32,
+}
+
+impl PolicyConfig {
+    /// A network for tests and examples: seconds to train, too small to learn much.
+    #[must_use]
+    pub fn tiny() -> Self {
+        Self {
+            n_obs_steps: 2,
+            n_image_steps: 1,
+            horizon: 16,
+            n_action_steps: 16,
+            lerobot_alignment: false,
+            cameras: vec!["table".to_owned(), "wrist".to_owned()],
+            image_size: 24,
+            crop_size: 20,
+            share_encoder: false,
+            encoder_width: 16,
+            encoder_blocks: vec![1],
+            keypoints: 4,
+            image_features: 8,
+            relative_features: false,
+            down_dims: vec![16, 16],
+            kernel_size: 3,
+            n_groups: 8,
+            step_embed_dim: 16,
+            prediction: Prediction::Sample,
+            train_timesteps: 100,
+            inference_steps: 4,
+            guidance: 1.0,
+        }
+    }
+
+    /// Numbers a state row becomes for the network.
+    #[must_use]
+    pub fn state_features(&self) -> usize {
+        e2h_core::STATE_DIM + if self.relative_features { 3 } else { 0 }
+    }
+
+    /// Width of the U-Net's global condition.
+    #[must_use]
+    pub fn condition_dim(&self) -> usize {
+        self.n_obs_steps * self.state_features() + self.n_image_steps * self.cameras.len() * self.image_features
+    }
+
+    /// Checks that the parts fit together.
+    ///
+    /// # Errors
+    /// Lists every problem with the values found.
+    pub fn validate(&self) -> Result<()> {
+        let mut problems = vec![];
+        let mut check = |ok: bool, text: String| {
+            if !ok {
+                problems.push(text);
+            }
+        };
+        let positive = |v: usize| v > 0;
+        check(positive(self.n_obs_steps), "n_obs_steps: expected at least 1, got 0".to_owned());
+        check(
+            self.n_image_steps <= self.n_obs_steps,
+            format!("n_image_steps: expected at most n_obs_steps ({}), got {}", self.n_obs_steps, self.n_image_steps),
+        );
+        let multiple = 1 << self.down_dims.len().saturating_sub(1);
+        check(!self.down_dims.is_empty(), "down_dims: expected at least one level, got none".to_owned());
+        check(
+            self.horizon > 0 && self.horizon.is_multiple_of(multiple),
+            format!(
+                "horizon: expected a multiple of {multiple} for {} levels, got {}",
+                self.down_dims.len(),
+                self.horizon
+            ),
+        );
+        let offset = if self.lerobot_alignment { self.n_obs_steps.saturating_sub(1) } else { 0 };
+        check(
+            self.n_action_steps > 0 && self.n_action_steps + offset <= self.horizon,
+            format!(
+                "n_action_steps: expected 1 to {} in this alignment, got {}",
+                self.horizon.saturating_sub(offset),
+                self.n_action_steps
+            ),
+        );
+        for d in &self.down_dims {
+            check(
+                self.n_groups > 0 && d.is_multiple_of(self.n_groups),
+                format!("down_dims: expected multiples of n_groups ({}), got {d}", self.n_groups),
+            );
+        }
+        check(self.kernel_size % 2 == 1, format!("kernel_size: expected an odd number, got {}", self.kernel_size));
+        check(
+            self.step_embed_dim >= 4 && self.step_embed_dim.is_multiple_of(2),
+            format!("step_embed_dim: expected an even number from 4, got {}", self.step_embed_dim),
+        );
+        check(
+            self.inference_steps > 0 && self.inference_steps <= self.train_timesteps,
+            format!("inference_steps: expected 1 to {}, got {}", self.train_timesteps, self.inference_steps),
+        );
+        if !self.cameras.is_empty() {
+            check(
+                self.crop_size > 0 && self.crop_size <= self.image_size,
+                format!("crop_size: expected 1 to image_size ({}), got {}", self.image_size, self.crop_size),
+            );
+            check(
+                self.encoder_width > 0 && self.encoder_width.is_multiple_of(16),
+                format!("encoder_width: expected a multiple of 16, got {}", self.encoder_width),
+            );
+            check(
+                !self.encoder_blocks.is_empty() && !self.encoder_blocks.contains(&0),
+                format!("encoder_blocks: expected at least one block a stage, got {:?}", self.encoder_blocks),
+            );
+        }
+        if problems.is_empty() { Ok(()) } else { Err(Error::Config(problems.join("; "))) }
+    }
+}
+
+/// How a policy is trained.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Observations of a step.
+    pub conditions: usize,
+    /// (noise, diffusion step) pairs drawn for each of them, so that the costly image encoding is shared. Source: Mini
+    /// Diffuser, arXiv 2505.09430.
+    pub noises: usize,
+    /// Probability that a sample's whole condition is zeroed.
+    pub conditioning_dropout: f32,
+    /// Standard deviation of the noise on normalised state entries in training.
+    pub observation_noise: f32,
+    /// Optimiser.
+    pub adam: AdamConfig,
+    /// Learning rate over the steps.
+    pub schedule: ScheduleConfig,
+    /// Average of the weights that the policy acts with.
+    pub ema: EmaConfig,
+}
+
+impl TrainConfig {
+    pub(crate) fn optimiser(&self) -> AdamConfig {
+        without_zero_clip(self.adam)
+    }
+}
+
+/// A clip of 0 in a file means none: TOML has no way to say so.
+pub(crate) fn without_zero_clip(adam: AdamConfig) -> AdamConfig {
+    AdamConfig { clip_norm: adam.clip_norm.filter(|&c| c > 0.0), ..adam }
+}
+
+/// Shape of the learning rate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ScheduleKind {
+    /// The same rate after the warm-up (the paper's).
+    Constant,
+    /// Half a cosine down to 0 at the stage's end.
+    Cosine,
+}
+
+/// Learning rate of a stage, whatever its length.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScheduleConfig {
+    /// Shape.
+    pub kind: ScheduleKind,
+    /// Highest rate.
+    pub lr: f32,
+    /// Steps over which it rises from 0.
+    pub warmup: usize,
+}
+
+impl ScheduleConfig {
+    /// The schedule of a stage of `steps` steps.
+    #[must_use]
+    pub fn over(&self, steps: usize) -> LrSchedule {
+        let Self { kind, lr, warmup } = *self;
+        match kind {
+            ScheduleKind::Constant => LrSchedule::Constant { lr, warmup },
+            ScheduleKind::Cosine => LrSchedule::Cosine { lr, warmup, steps },
+        }
+    }
+}
+
+/// The critic and its training.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CriticConfig {
+    /// Crop that the critic sees, pixels.
+    pub crop_size: usize,
+    /// Widths of the hidden layers.
+    pub hidden: Vec<usize>,
+    /// Dropout between them.
+    pub dropout: f32,
+    /// Half-width of the random factor on brightness and contrast of a training image.
+    pub colour_jitter: f32,
+    /// Frames of a step.
+    pub batch: usize,
+    /// Training steps.
+    pub steps: usize,
+    /// Share of the trajectories held out for validation.
+    pub validation: f32,
+    /// Optimiser.
+    pub adam: AdamConfig,
+}

@@ -1,0 +1,198 @@
+//! The critic: how far along is this frame?
+
+use crate::batch::{Host, Rows};
+use crate::config::without_zero_clip;
+use crate::model::ConditionEncoder;
+use crate::{CriticConfig, Error, PolicyConfig, Result};
+use candle_core::{Device, Tensor};
+use e2h_core::{Episode, Rng, Value, stream};
+use e2h_data::Normaliser;
+use e2h_nn::{Adam, Mlp, Mode, Params, Weights, backward};
+use rand::Rng as _;
+use rand::seq::SliceRandom as _;
+
+/// A value function on two-step visual-state input.
+pub struct Critic {
+    params: Params,
+    condition: ConditionEncoder,
+    head: Mlp,
+    normaliser: Normaliser,
+    /// The policy's configuration with the critic's crop.
+    config: PolicyConfig,
+}
+
+/// What training a critic ended with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CriticReport {
+    /// Mean squared error on the training trajectories over the last tenth of the steps.
+    pub train_loss: f64,
+    /// Mean squared error on the held-out trajectories; none when there was nothing to hold out.
+    pub validation_loss: Option<f64>,
+    /// Loss of every step.
+    pub losses: Vec<f32>,
+}
+
+impl Critic {
+    fn new(policy: &PolicyConfig, critic: &CriticConfig, normaliser: &Normaliser, mode: Mode, seed: u64) -> Result<Self> {
+        let config = PolicyConfig { crop_size: critic.crop_size.min(policy.crop_size), ..policy.clone() };
+        let dims: Vec<usize> =
+            std::iter::once(config.condition_dim()).chain(critic.hidden.iter().copied()).chain([1]).collect();
+        let mut condition = None;
+        let (params, head) = Params::build(mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
+            condition = Some(ConditionEncoder::new(&config, &b.pp("diffusion")));
+            Mlp::new(&dims, critic.dropout, &b.pp("head"))
+        })?;
+        let condition = condition.unwrap_or_else(|| Err(Error::Config("the critic has no encoder".to_owned())))?;
+        Ok(Self { params, condition, head, normaliser: normaliser.clone(), config })
+    }
+
+    /// Starts the image encoders from a policy's; the head stays as drawn.
+    fn adopt_encoders(&self, policy: &Weights) -> Result<()> {
+        let mut weights = self.params.export()?;
+        for (name, tensor) in &mut weights {
+            if let Some(found) = policy.get(name).filter(|f| f.shape == tensor.shape) {
+                tensor.clone_from(found);
+            }
+        }
+        Ok(self.params.import(&weights)?)
+    }
+
+    fn forward(&self, host: Host, dropout: Option<&mut Rng>) -> Result<Tensor> {
+        let (state, images) = host.tensors(self.config.crop_size)?;
+        let condition = self.condition.forward(&state, &images)?;
+        Ok(self.head.forward(&condition, dropout)?)
+    }
+
+    fn push(&self, host: &mut Host, episode: &Episode, t: usize, augment: Option<(&mut Rng, f32)>) -> Result<()> {
+        let c = &self.config;
+        let rows: Vec<usize> = (0..c.n_obs_steps).map(|k| (t + k + 1).saturating_sub(c.n_obs_steps)).collect();
+        host.push_state(Rows::Episode(episode, &rows), &self.normaliser, None);
+        if c.n_image_steps == 0 {
+            return Ok(());
+        }
+        let mut augment = augment;
+        for camera in 0..c.cameras.len() {
+            let (corner, jitter) = match &mut augment {
+                Some((rng, width)) => {
+                    let mut draw = || if *width > 0.0 { rng.random_range(-*width..=*width) } else { 0.0 };
+                    let jitter = (1.0 + draw(), draw() * 0.5);
+                    (c.random_crop(rng), Some(jitter))
+                }
+                None => (c.centre_crop(), None),
+            };
+            let frames = episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
+                Error::Data(format!(
+                    "expected images of {0} x {0} from camera {1}, found {2:?}",
+                    c.image_size,
+                    c.cameras[camera],
+                    episode.frames.iter().map(|f| (&f.camera, f.height)).collect::<Vec<_>>()
+                ))
+            })?;
+            for &row in &rows[c.n_obs_steps - c.n_image_steps..] {
+                host.push_image(camera, frames.image(row), corner, c.crop_size, jitter);
+            }
+        }
+        Ok(())
+    }
+
+    /// Value of every row of `episode`.
+    ///
+    /// # Errors
+    /// When the episode's images do not fit the critic.
+    pub fn evaluate(&self, episode: &Episode) -> Result<Vec<f32>> {
+        let mut values = Vec::with_capacity(episode.len());
+        let rows: Vec<usize> = (0..episode.len()).collect();
+        for batch in rows.chunks(64) {
+            let mut host = Host::new(&self.config);
+            for &t in batch {
+                self.push(&mut host, episode, t, None)?;
+            }
+            values.extend(self.forward(host, None)?.flatten_all()?.to_vec1::<f32>()?);
+        }
+        Ok(values)
+    }
+}
+
+impl Value for Critic {
+    fn values(&self, episode: &Episode) -> e2h_core::Result<Vec<f32>> {
+        Ok(self.evaluate(episode)?)
+    }
+}
+
+/// `G_t = (T - t) r + r_T` with `r = -1 / (2 H)`, `r_T` 1 for a success and 0 otherwise (the paper's equation 9).
+fn target(episode: &Episode, t: usize, horizon: usize) -> f32 {
+    let remaining = (episode.len() - t) as f32;
+    let terminal = if episode.outcome.is_success() { 1.0 } else { 0.0 };
+    terminal - remaining / (2.0 * horizon as f32)
+}
+
+/// Trains a critic from scratch on hard rollouts, failures included; its encoders start from the policy's weights.
+///
+/// `progress` is told (steps done, loss) after every step.
+///
+/// # Errors
+/// When there are no rollouts, they do not fit, or the loss is not finite.
+#[allow(clippy::too_many_arguments, reason = "each is a different thing, and none has a natural default")]
+pub fn train_critic(
+    policy: &PolicyConfig,
+    critic: &CriticConfig,
+    normaliser: &Normaliser,
+    policy_weights: &Weights,
+    rollouts: &[Episode],
+    horizon: usize,
+    seed: u64,
+    purpose: &str,
+    mut progress: impl FnMut(usize, f32),
+) -> Result<(Critic, CriticReport)> {
+    let mut order: Vec<&Episode> = rollouts.iter().filter(|e| !e.is_empty()).collect();
+    if order.is_empty() {
+        return Err(Error::Data("the critic needs at least one hard rollout, got none".to_owned()));
+    }
+    order.shuffle(&mut stream(seed, purpose, 0, u64::MAX));
+    let held = ((order.len() as f32 * critic.validation) as usize).min(order.len() - 1);
+    let (validation, training) = order.split_at(held);
+
+    let network = Critic::new(policy, critic, normaliser, Mode::Train, seed)?;
+    network.adopt_encoders(policy_weights)?;
+    let mut adam = Adam::new(&without_zero_clip(critic.adam), &network.params)?;
+    let mut losses = Vec::with_capacity(critic.steps);
+    for step in 0..critic.steps {
+        let mut rng = stream(seed, purpose, 0, step as u64);
+        let mut host = Host::new(&network.config);
+        let mut targets = Vec::with_capacity(critic.batch);
+        for _ in 0..critic.batch {
+            // Trajectories first, then a row: long failures would outweigh short successes otherwise.
+            let episode = training[rng.random_range(0..training.len())];
+            let t = rng.random_range(0..episode.len());
+            network.push(&mut host, episode, t, Some((&mut rng, critic.colour_jitter)))?;
+            targets.push(target(episode, t, horizon));
+        }
+        let target = Tensor::from_vec(targets, (critic.batch, 1), &Device::Cpu)?;
+        let loss = (network.forward(host, Some(&mut rng))? - target)?.sqr()?.mean_all()?;
+        let value = loss.to_scalar::<f32>()?;
+        if !value.is_finite() {
+            return Err(Error::NotFinite { step, seed, loss: value });
+        }
+        let grads = backward(&loss, &network.params)?;
+        adam.step(&network.params, &grads, critic.adam.lr)?;
+        losses.push(value);
+        progress(step + 1, value);
+    }
+
+    let trained = Critic::new(policy, critic, normaliser, Mode::Infer, seed)?;
+    trained.params.import(&network.params.export()?)?;
+    let mut squares = (0.0, 0usize);
+    for episode in validation {
+        for (t, v) in trained.evaluate(episode)?.iter().enumerate() {
+            squares.0 += f64::from(v - target(episode, t, horizon)).powi(2);
+            squares.1 += 1;
+        }
+    }
+    let tail = &losses[losses.len() - (losses.len() / 10).max(1).min(losses.len())..];
+    let report = CriticReport {
+        train_loss: tail.iter().map(|&l| f64::from(l)).sum::<f64>() / tail.len().max(1) as f64,
+        validation_loss: (squares.1 > 0).then(|| squares.0 / squares.1 as f64),
+        losses,
+    };
+    Ok((trained, report))
+}

@@ -1,0 +1,69 @@
+use std::path::PathBuf;
+
+/// What can go wrong with a policy, its training or its checkpoint.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum Error {
+    /// A configuration that cannot work; one line a problem.
+    #[error("policy configuration: {0}")]
+    Config(String),
+    /// Observations that do not fit the policy.
+    #[error("observation: {quantity}: expected {expected}, got {found}")]
+    Observation {
+        /// What was looked at.
+        quantity: String,
+        /// What the policy was made for.
+        expected: String,
+        /// What came.
+        found: String,
+    },
+    /// Training data that does not fit, or is missing.
+    #[error("training data: {0}")]
+    Data(String),
+    /// The loss is not a finite number.
+    #[error("training diverged: the loss is {loss} at step {step} (seed {seed}); the last good checkpoint is kept")]
+    NotFinite {
+        /// Step at which it appeared.
+        step: usize,
+        /// Seed of the training run.
+        seed: u64,
+        /// The loss.
+        loss: f32,
+    },
+    /// A checkpoint that does not match what is asked of it; lists all that differs.
+    #[error("checkpoint {path}: {problem}")]
+    Checkpoint {
+        /// Folder or file.
+        path: PathBuf,
+        /// What was expected and what was found.
+        problem: String,
+    },
+    /// Reading or writing failed.
+    #[error("{doing} {path}: {source}")]
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// File or folder.
+        path: PathBuf,
+        /// The system's answer.
+        source: std::io::Error,
+    },
+    /// The network library failed.
+    #[error(transparent)]
+    Nn(#[from] e2h_nn::Error),
+    /// Candle failed.
+    #[error("tensor operation: {0}")]
+    Candle(#[from] candle_core::Error),
+    /// Windows or normaliser failed.
+    #[error(transparent)]
+    Dataset(#[from] e2h_data::Error),
+}
+
+impl From<Error> for e2h_core::Error {
+    fn from(error: Error) -> Self {
+        Self::Model(error.to_string())
+    }
+}
+
+/// Shorthand for a result with this crate's [`enum@Error`].
+pub type Result<T> = std::result::Result<T, Error>;

@@ -1,0 +1,130 @@
+//! Encoders, condition and U-Net: the network behind a policy.
+
+use crate::{PolicyConfig, Result};
+use candle_core::Tensor;
+use e2h_core::{ACTION_DIM, Rng};
+use e2h_nn::{Builder, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig};
+
+/// Turns images and states into one vector an observation history.
+pub(crate) struct ConditionEncoder {
+    encoders: Vec<RgbEncoder>,
+    config: PolicyConfig,
+}
+
+impl ConditionEncoder {
+    pub(crate) fn new(config: &PolicyConfig, builder: &Builder) -> Result<Self> {
+        let encoder = RgbEncoderConfig {
+            height: config.crop_size,
+            width: config.crop_size,
+            base_width: config.encoder_width,
+            stage_blocks: config.encoder_blocks.clone(),
+            keypoints: config.keypoints,
+            feature_dim: config.image_features,
+        };
+        let names: Vec<String> = match (config.cameras.len(), config.share_encoder) {
+            (0, _) => vec![],
+            (_, true) => vec!["rgb_encoder".to_owned()],
+            (n, false) => (0..n).map(|i| format!("rgb_encoder.{i}")).collect(),
+        };
+        let encoders =
+            names.iter().map(|name| RgbEncoder::new(&encoder, &builder.pp(name))).collect::<e2h_nn::Result<_>>()?;
+        Ok(Self { encoders, config: config.clone() })
+    }
+
+    /// The condition vector.
+    ///
+    /// # Shapes
+    /// `state` (B, To * S); `images` one tensor a camera, each (B * `n_image_steps`, H, W, 3) in [0, 1], the steps of one
+    /// sample together, oldest first. Result (B, condition).
+    ///
+    /// # Source
+    /// Order of LeRobot 0.4.4 `_prepare_global_conditioning`: for each step the state, then each camera's features.
+    pub(crate) fn forward(&self, state: &Tensor, images: &[Tensor]) -> Result<Tensor> {
+        let c = &self.config;
+        if self.encoders.is_empty() || c.n_image_steps == 0 {
+            return Ok(state.clone());
+        }
+        let b = state.dim(0)?;
+        let features = images
+            .iter()
+            .enumerate()
+            .map(|(camera, x)| {
+                let encoder = &self.encoders[camera.min(self.encoders.len() - 1)];
+                Ok(encoder.forward(x)?.reshape((b, c.n_image_steps, c.image_features))?)
+            })
+            .collect::<Result<Vec<_>>>()?;
+        let features = Tensor::cat(&features, 2)?;
+        if c.n_image_steps == c.n_obs_steps {
+            let state = state.reshape((b, c.n_obs_steps, c.state_features()))?;
+            return Ok(Tensor::cat(&[&state, &features], 2)?.flatten_from(1)?);
+        }
+        // Differs: LeRobot pairs every state with images; with fewer image steps all states come first.
+        Ok(Tensor::cat(&[state, &features.flatten_from(1)?], 1)?)
+    }
+}
+
+/// The denoising network with its encoders and parameters.
+///
+/// # Source
+/// LeRobot 0.4.4 `DiffusionModel`; parameter names are those of its `DiffusionPolicy` (prefix `diffusion.`).
+pub struct DiffusionModel {
+    pub(crate) params: Params,
+    condition: ConditionEncoder,
+    unet: ConditionalUnet1d,
+}
+
+impl DiffusionModel {
+    /// A network with freshly drawn weights.
+    ///
+    /// # Errors
+    /// When the configuration does not fit together.
+    pub fn new(config: &PolicyConfig, mode: Mode, rng: &mut Rng) -> Result<Self> {
+        config.validate()?;
+        let unet = UnetConfig {
+            input_dim: ACTION_DIM,
+            down_dims: config.down_dims.clone(),
+            kernel_size: config.kernel_size,
+            n_groups: config.n_groups,
+            step_embed_dim: config.step_embed_dim,
+            cond_dim: config.condition_dim(),
+        };
+        let mut condition = None;
+        let (params, unet) = Params::build(mode, rng, |b| {
+            let b = b.pp("diffusion");
+            condition = Some(ConditionEncoder::new(config, &b));
+            ConditionalUnet1d::new(&unet, &b.pp("unet"))
+        })?;
+        let condition =
+            condition.unwrap_or_else(|| Err(crate::Error::Config("the network has no encoder".to_owned())))?;
+        Ok(Self { params, condition, unet })
+    }
+
+    /// Names, shapes and values of the parameters.
+    #[must_use]
+    pub fn params(&self) -> &Params {
+        &self.params
+    }
+
+    /// The condition vector of observation histories.
+    ///
+    /// # Shapes
+    /// `state` (B, To * S) normalised; `images` one tensor a camera, (B * `n_image_steps`, H, W, 3) in [0, 1]. Result
+    /// (B, condition).
+    ///
+    /// # Errors
+    /// When shapes do not fit the configuration.
+    pub fn condition(&self, state: &Tensor, images: &[Tensor]) -> Result<Tensor> {
+        self.condition.forward(state, images)
+    }
+
+    /// The network's answer to noisy actions.
+    ///
+    /// # Shapes
+    /// `x` (B, T, 8), `timesteps` (B), `condition` (B, condition). Result (B, T, 8).
+    ///
+    /// # Errors
+    /// When shapes do not fit the configuration.
+    pub fn forward(&self, x: &Tensor, timesteps: &[f32], condition: &Tensor) -> Result<Tensor> {
+        Ok(self.unet.forward(x, timesteps, condition)?)
+    }
+}

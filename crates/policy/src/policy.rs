@@ -1,0 +1,195 @@
+//! A trained policy: observations in, action chunks out.
+
+use crate::batch::{Host, Rows};
+use crate::{Checkpoint, Ddim, DiffusionModel, Error, PolicyConfig, Provenance, Result};
+use candle_core::{Device, Tensor};
+use e2h_core::{ACTION_DIM, Action, ActionChunk, Observation, Policy, Rng, stream};
+use e2h_data::Normaliser;
+use e2h_nn::{Mode, Weights};
+use rand::Rng as _;
+use std::path::Path;
+
+/// A diffusion policy ready to act.
+pub struct DiffusionPolicy {
+    model: DiffusionModel,
+    ddim: Ddim,
+    normaliser: Normaliser,
+    config: PolicyConfig,
+}
+
+impl DiffusionPolicy {
+    /// A policy with random weights.
+    ///
+    /// # Errors
+    /// When the configuration does not fit together.
+    pub fn untrained(config: &PolicyConfig, normaliser: &Normaliser, seed: u64) -> Result<Self> {
+        let model = DiffusionModel::new(config, Mode::Infer, &mut stream(seed, "weights", 0, 0))?;
+        let ddim = Ddim::new(config.train_timesteps, config.inference_steps, config.prediction)?;
+        Ok(Self { model, ddim, normaliser: normaliser.clone(), config: config.clone() })
+    }
+
+    /// A policy with given weights.
+    ///
+    /// # Errors
+    /// When the weights are not those of this configuration; lists every tensor that differs.
+    pub fn with_weights(config: &PolicyConfig, normaliser: &Normaliser, weights: &Weights) -> Result<Self> {
+        let policy = Self::untrained(config, normaliser, 0)?;
+        policy.model.params.import(weights)?;
+        Ok(policy)
+    }
+
+    /// Reads a checkpoint folder.
+    ///
+    /// # Errors
+    /// When a file is missing, foreign or does not match; names what was expected and found.
+    pub fn load(dir: &Path) -> Result<(Self, Checkpoint)> {
+        let (checkpoint, weights) = Checkpoint::read(dir)?;
+        let policy = Self::with_weights(&checkpoint.config, &checkpoint.normaliser, &weights)
+            .map_err(|e| Error::Checkpoint { path: dir.to_owned(), problem: e.to_string() })?;
+        Ok((policy, checkpoint))
+    }
+
+    /// Writes a checkpoint folder that stands alone.
+    ///
+    /// # Errors
+    /// When the folder cannot be written.
+    pub fn save(&self, dir: &Path, provenance: &Provenance) -> Result<()> {
+        Checkpoint {
+            config: self.config.clone(),
+            normaliser: self.normaliser.clone(),
+            provenance: provenance.clone(),
+        }
+        .write(dir, &self.weights()?)
+    }
+
+    /// The weights that it acts with.
+    ///
+    /// # Errors
+    /// When they cannot be read back from the device.
+    pub fn weights(&self) -> Result<Weights> {
+        Ok(self.model.params.export()?)
+    }
+
+    /// Architecture and inference settings.
+    #[must_use]
+    pub fn config(&self) -> &PolicyConfig {
+        &self.config
+    }
+
+    /// Scaling of states and actions.
+    #[must_use]
+    pub fn normaliser(&self) -> &Normaliser {
+        &self.normaliser
+    }
+
+    /// Number of parameters.
+    #[must_use]
+    pub fn parameters(&self) -> usize {
+        self.model.params.count()
+    }
+
+    fn check(&self, histories: &[Vec<&Observation>]) -> Result<()> {
+        let c = &self.config;
+        let wrong = |quantity: &str, expected: String, found: String| {
+            Err(Error::Observation { quantity: quantity.to_owned(), expected, found })
+        };
+        for history in histories {
+            if history.len() != c.n_obs_steps {
+                return wrong("steps of history", c.n_obs_steps.to_string(), history.len().to_string());
+            }
+            for observation in history {
+                if observation.frames.len() < c.cameras.len() {
+                    return wrong("cameras", format!("{:?}", c.cameras), observation.frames.len().to_string());
+                }
+                for (image, camera) in observation.frames.iter().zip(&c.cameras) {
+                    let n = c.image_size;
+                    if (image.height, image.width) != (n, n) || image.data.len() != n * n * 3 {
+                        return wrong(
+                            &format!("image of camera `{camera}`"),
+                            format!("{n} x {n}"),
+                            format!("{} x {} ({} bytes)", image.height, image.width, image.data.len()),
+                        );
+                    }
+                }
+                if let Some(v) = observation.state.iter().find(|v| !v.is_finite()) {
+                    return wrong("state", "finite numbers".to_owned(), v.to_string());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Actions for each history; see [`Policy::act`].
+    ///
+    /// # Errors
+    /// When the observations do not fit the policy.
+    pub fn sample(&self, histories: &[Vec<&Observation>], rngs: &mut [Rng]) -> Result<Vec<ActionChunk>> {
+        if histories.len() != rngs.len() {
+            return Err(Error::Observation {
+                quantity: "random streams".to_owned(),
+                expected: histories.len().to_string(),
+                found: rngs.len().to_string(),
+            });
+        }
+        if histories.is_empty() {
+            return Ok(vec![]);
+        }
+        self.check(histories)?;
+        let c = &self.config;
+        let mut host = Host::new(c);
+        for history in histories {
+            host.push_state(Rows::Observations(history), &self.normaliser, None);
+            let first_image = c.n_obs_steps - c.n_image_steps;
+            for camera in 0..c.cameras.len() {
+                for observation in &history[first_image..] {
+                    host.push_image(camera, &observation.frames[camera].data, c.centre_crop(), c.crop_size, None);
+                }
+            }
+        }
+        let (state, images) = host.tensors(c.crop_size)?;
+        let condition = self.model.condition(&state, &images)?;
+        let (b, per) = (histories.len(), c.horizon * ACTION_DIM);
+        let mut x = Vec::with_capacity(b * per);
+        for rng in rngs.iter_mut() {
+            x.extend((0..per).map(|_| rng.sample::<f32, _>(rand_distr::StandardNormal)));
+        }
+        let free = (c.guidance != 1.0).then(|| condition.zeros_like()).transpose()?;
+        for step in self.ddim.steps() {
+            let timesteps = vec![step.timestep as f32; b];
+            let input = Tensor::from_slice(&x, (b, c.horizon, ACTION_DIM), &Device::Cpu)?;
+            let mut output = self.model.forward(&input, &timesteps, &condition)?;
+            if let Some(free) = &free {
+                // Source: classifier-free guidance, arXiv 2207.12598, equation 6 in the form u + w (c - u).
+                let unconditional = self.model.forward(&input, &timesteps, free)?;
+                output = (&unconditional + ((output - &unconditional)? * f64::from(c.guidance))?)?;
+            }
+            let output = output.flatten_all()?.to_vec1::<f32>()?;
+            self.ddim.step(step, &output, &mut x);
+        }
+        let first = if c.lerobot_alignment { c.n_obs_steps - 1 } else { 0 };
+        Ok(x.chunks_exact(per)
+            .map(|sample| {
+                sample
+                    .chunks_exact(ACTION_DIM)
+                    .skip(first)
+                    .take(c.n_action_steps)
+                    .map(|row| {
+                        let mut action: Action = [0.0; ACTION_DIM];
+                        action.copy_from_slice(row);
+                        self.normaliser.unnormalise_action(&action)
+                    })
+                    .collect()
+            })
+            .collect())
+    }
+}
+
+impl Policy for DiffusionPolicy {
+    fn n_obs_steps(&self) -> usize {
+        self.config.n_obs_steps
+    }
+
+    fn act(&self, histories: &[Vec<&Observation>], rngs: &mut [Rng]) -> e2h_core::Result<Vec<ActionChunk>> {
+        Ok(self.sample(histories, rngs)?)
+    }
+}

@@ -1,0 +1,259 @@
+//! Training of a diffusion policy, one step at a time, exactly resumable.
+
+use crate::batch::{Host, Rows};
+use crate::{Ddim, DiffusionModel, Error, PolicyConfig, Prediction, Result, TrainConfig};
+use candle_core::{Device, Tensor};
+use e2h_core::{ACTION_DIM, Episode, Rng, stream};
+use e2h_data::{Alignment, Normaliser, Sampler, Set, Window, WindowConfig, Windows};
+use e2h_nn::{Adam, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows};
+use rand::Rng as _;
+use std::path::Path;
+use std::sync::Arc;
+
+/// What a policy learns from: windows of two sets of episodes, and how they are scaled.
+pub struct TrainingData<'a> {
+    base: (&'a [Arc<Episode>], Windows),
+    accepted: (&'a [Arc<Episode>], Windows),
+    sampler: Sampler,
+    normaliser: &'a Normaliser,
+}
+
+impl<'a> TrainingData<'a> {
+    /// Windows over `base` (the initial demonstrations) and `accepted` (what refinement kept), of which every batch takes
+    /// `base_share` from the first.
+    ///
+    /// # Errors
+    /// When both are empty.
+    pub fn new(
+        base: &'a [Arc<Episode>],
+        accepted: &'a [Arc<Episode>],
+        base_share: f32,
+        config: &PolicyConfig,
+        normaliser: &'a Normaliser,
+    ) -> Result<Self> {
+        let window = WindowConfig {
+            n_obs_steps: config.n_obs_steps,
+            horizon: config.horizon,
+            alignment: if config.lerobot_alignment { Alignment::LeRobot } else { Alignment::Paper },
+        };
+        let base = (base, Windows::new(base, &window));
+        let accepted = (accepted, Windows::new(accepted, &window));
+        let sampler = Sampler::new(&base.1, &accepted.1, f64::from(base_share))?;
+        Ok(Self { base, accepted, sampler, normaliser })
+    }
+
+    fn batch(&self, size: usize, rng: &mut Rng) -> Vec<(&Episode, Window)> {
+        let picks = self.sampler.batch(size, rng);
+        picks
+            .into_iter()
+            .map(|pick| {
+                let (episodes, windows) = match pick.set {
+                    Set::First => &self.base,
+                    Set::Second => &self.accepted,
+                };
+                let window = windows.window(pick.window);
+                (&*episodes[window.episode], window)
+            })
+            .collect()
+    }
+}
+
+/// A policy in training: network, optimiser, average of the weights, step counter.
+pub struct Trainer {
+    model: DiffusionModel,
+    adam: Adam,
+    ema: Ema,
+    ddim: Ddim,
+    config: PolicyConfig,
+    train: TrainConfig,
+    schedule: LrSchedule,
+    seed: u64,
+    purpose: String,
+    step: usize,
+}
+
+impl Trainer {
+    /// A trainer at step 0 of `steps` (the length of the learning-rate schedule). `start` are the weights to continue from; without them they are drawn from `seed`. `purpose`
+    /// names the random streams (for example `train/hard/3`), so that two stages of a run never share one.
+    ///
+    /// # Errors
+    /// When the configuration does not fit together or `start` is of another network.
+    pub fn new(
+        config: &PolicyConfig,
+        train: &TrainConfig,
+        steps: usize,
+        start: Option<&Weights>,
+        seed: u64,
+        purpose: &str,
+    ) -> Result<Self> {
+        if train.conditions == 0 || train.noises == 0 {
+            return Err(Error::Config(format!(
+                "conditions and noises: expected at least 1, got {} and {}",
+                train.conditions, train.noises
+            )));
+        }
+        let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
+        if let Some(weights) = start {
+            model.params.import(weights)?;
+        }
+        let adam = Adam::new(&train.optimiser(), &model.params)?;
+        let ema = Ema::new(&train.ema, &model.params)?;
+        let ddim = Ddim::new(config.train_timesteps, config.inference_steps, config.prediction)?;
+        Ok(Self {
+            model,
+            adam,
+            ema,
+            ddim,
+            config: config.clone(),
+            train: train.clone(),
+            schedule: train.schedule.over(steps),
+            seed,
+            purpose: purpose.to_owned(),
+            step: 0,
+        })
+    }
+
+    /// Steps done.
+    #[must_use]
+    pub fn step_count(&self) -> usize {
+        self.step
+    }
+
+    /// One optimiser step; returns its loss.
+    ///
+    /// # Source
+    /// Ho et al., arXiv 2006.11239, algorithm 1, on action chunks (Chi et al., arXiv 2303.04137); the loss leaves out
+    /// actions past the end of a cut segment.
+    ///
+    /// # Errors
+    /// When the data do not fit, or the loss is not finite.
+    pub fn step(&mut self, data: &TrainingData<'_>) -> Result<f32> {
+        // A stream a step: nothing of the generator has to be stored for an exact resume.
+        let mut rng = stream(self.seed, &self.purpose, 0, self.step as u64);
+        let loss = self.loss(data, &mut rng)?;
+        let value = loss.to_scalar::<f32>()?;
+        if !value.is_finite() {
+            return Err(Error::NotFinite { step: self.step, seed: self.seed, loss: value });
+        }
+        let grads = backward(&loss, &self.model.params)?;
+        let lr = learning_rate(&self.schedule, self.step);
+        self.adam.step(&self.model.params, &grads, lr)?;
+        self.ema.update(&self.model.params)?;
+        self.step += 1;
+        Ok(value)
+    }
+
+    fn loss(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Tensor> {
+        let (c, t) = (&self.config, &self.train);
+        let mut host = Host::new(c);
+        let (per, rows) = (c.horizon * ACTION_DIM, t.conditions * t.noises);
+        let mut clean = Vec::with_capacity(t.conditions * per);
+        let mut mask = Vec::with_capacity(rows * c.horizon);
+        let first_image = c.n_obs_steps - c.n_image_steps;
+        for (episode, window) in data.batch(t.conditions, rng) {
+            host.push_state(
+                Rows::Episode(episode, &window.observations),
+                data.normaliser,
+                Some((t.observation_noise, rng)),
+            );
+            if c.n_image_steps > 0 {
+                for camera in 0..c.cameras.len() {
+                    let corner = c.random_crop(rng);
+                    let frames = episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
+                        Error::Data(format!(
+                            "expected images of {0} x {0} from {1:?}, found {2:?}",
+                            c.image_size,
+                            c.cameras,
+                            episode.frames.iter().map(|f| (&f.camera, f.height, f.width)).collect::<Vec<_>>()
+                        ))
+                    })?;
+                    for &row in &window.observations[first_image..] {
+                        host.push_image(camera, frames.image(row), corner, c.crop_size, None);
+                    }
+                }
+            }
+            for &row in &window.actions {
+                clean.extend(data.normaliser.normalise_action(&episode.action[row]));
+            }
+            for _ in 0..t.noises {
+                mask.extend(window.mask.iter().map(|&m| if m { 1.0 } else { 0.0 }));
+            }
+        }
+        let mut noisy = Vec::with_capacity(rows * per);
+        let mut target = Vec::with_capacity(rows * per);
+        let mut timesteps = Vec::with_capacity(rows);
+        let mut keep = Vec::with_capacity(rows);
+        for sample in clean.chunks_exact(per) {
+            for _ in 0..t.noises {
+                let k = rng.random_range(0..c.train_timesteps);
+                let noise: Vec<f32> = (0..per).map(|_| rng.sample(rand_distr::StandardNormal)).collect();
+                let start = noisy.len();
+                noisy.extend_from_slice(sample);
+                self.ddim.add_noise(&mut noisy[start..], &noise, k);
+                match c.prediction {
+                    Prediction::Epsilon => target.extend(noise),
+                    Prediction::Sample => target.extend_from_slice(sample),
+                }
+                timesteps.push(k as f32);
+                keep.push(if rng.random::<f32>() < t.conditioning_dropout { 0.0 } else { 1.0f32 });
+            }
+        }
+        let (state, images) = host.tensors(c.crop_size)?;
+        let mut condition = repeat_rows(&self.model.condition(&state, &images)?, t.noises)?;
+        if keep.contains(&0.0) {
+            condition = condition.broadcast_mul(&Tensor::from_vec(keep, (rows, 1), &Device::Cpu)?)?;
+        }
+        let shape = (rows, c.horizon, ACTION_DIM);
+        let noisy = Tensor::from_vec(noisy, shape, &Device::Cpu)?;
+        let target = Tensor::from_vec(target, shape, &Device::Cpu)?;
+        let mask = Tensor::from_vec(mask, (rows, c.horizon), &Device::Cpu)?;
+        let output = self.model.forward(&noisy, &timesteps, &condition)?;
+        Ok(mse(&output, &target, Some(&mask))?)
+    }
+
+    /// The averaged weights: the policy to act with.
+    ///
+    /// # Errors
+    /// When they cannot be read back.
+    pub fn weights(&self) -> Result<Weights> {
+        Ok(self.ema.weights()?)
+    }
+
+    /// Writes everything that [`Trainer::restore`] needs to go on as if nothing had happened.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let mut all = Weights::new();
+        for (part, tensors) in
+            [("model", self.model.params.export()?), ("adam", self.adam.state()?), ("ema", self.ema.state()?)]
+        {
+            all.extend(tensors.into_iter().map(|(name, t)| (format!("{part}/{name}"), t)));
+        }
+        all.insert("step".to_owned(), HostTensor { shape: vec![1], data: vec![self.step as f32] });
+        Ok(e2h_nn::save_weights(path, &all, &std::collections::BTreeMap::new())?)
+    }
+
+    /// Continues from a file that [`Trainer::save`] wrote.
+    ///
+    /// # Errors
+    /// When the file is missing or of another network.
+    pub fn restore(&mut self, path: &Path) -> Result<()> {
+        let (mut all, _) = e2h_nn::load_weights(path)?;
+        let step = all.remove("step").and_then(|t| t.data.first().copied());
+        let step = step.ok_or_else(|| Error::Checkpoint {
+            path: path.to_owned(),
+            problem: "expected a training state with tensor `step`, found none".to_owned(),
+        })?;
+        let part = |prefix: &str| -> Weights {
+            all.iter()
+                .filter_map(|(name, t)| Some((name.strip_prefix(prefix)?.to_owned(), t.clone())))
+                .collect()
+        };
+        self.model.params.import(&part("model/"))?;
+        self.adam.load_state(&part("adam/"))?;
+        self.ema.load_state(&part("ema/"))?;
+        self.step = step as usize;
+        Ok(())
+    }
+}

@@ -1,0 +1,79 @@
+//! The command line that every benchmark example has.
+
+use anyhow::bail;
+use auto_e2h::learn::RunOptions;
+use clap::{Parser, ValueEnum};
+use std::path::PathBuf;
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Preset {
+    /// Under a minute; shows that everything runs.
+    Smoke,
+    /// Two CPU cores, images and state; the default.
+    Laptop,
+    /// The paper's values.
+    Paper,
+}
+
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum Device {
+    Cpu,
+    Cuda,
+}
+
+/// Learns the hard task of a pair from reversed demonstrations of the easy one.
+#[derive(Parser)]
+struct Arguments {
+    /// Sizes and step counts to run with.
+    #[arg(long, value_enum, default_value = "laptop")]
+    preset: Preset,
+    /// Seed of everything random.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Updates of the hard policy (by default the preset's).
+    #[arg(long)]
+    iterations: Option<u32>,
+    /// Run directory (by default runs/<task>-<preset>-<seed>).
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Go on with a run directory that exists.
+    #[arg(long)]
+    resume: bool,
+    /// Where networks are computed.
+    #[arg(long, value_enum, default_value = "cpu")]
+    device: Device,
+    /// Override a value of the configuration, for example loop.cycles=20 (may be repeated).
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Threads (by default one a core); never changes a result.
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Show no progress.
+    #[arg(long)]
+    quiet: bool,
+}
+
+/// What the command line asks for.
+pub fn options(task: &str) -> anyhow::Result<RunOptions> {
+    let a = Arguments::parse();
+    if a.device == Device::Cuda {
+        bail!("--device cuda: this version computes on the CPU only");
+    }
+    let preset = match a.preset {
+        Preset::Smoke => "smoke",
+        Preset::Laptop => "laptop",
+        Preset::Paper => "paper",
+    };
+    let mut set = a.set;
+    set.extend(a.iterations.map(|n| format!("loop.iterations={n}")));
+    Ok(RunOptions {
+        task: task.to_owned(),
+        preset: preset.to_owned(),
+        seed: a.seed,
+        set,
+        out: a.out,
+        resume: a.resume,
+        threads: a.threads,
+        quiet: a.quiet,
+    })
+}

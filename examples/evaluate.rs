@@ -1,0 +1,82 @@
+//! Measures a published policy.
+//!
+//! ```text
+//! cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7
+//! ```
+
+use anyhow::Context;
+use auto_e2h::learn::{Progress, Published, evaluate, film, report};
+use clap::Parser;
+use std::path::PathBuf;
+
+/// Runs a policy from fresh resets and counts successes.
+#[derive(Parser)]
+struct Arguments {
+    /// Folder with policy.json and model.safetensors.
+    #[arg(long, value_name = "DIR")]
+    checkpoint: PathBuf,
+    /// Trials.
+    #[arg(long, default_value_t = 50)]
+    trials: usize,
+    /// Seed of the trials; training never sees 100000 and up.
+    #[arg(long, default_value_t = 100_001)]
+    seed: u64,
+    /// Print one JSON line and nothing else.
+    #[arg(long)]
+    json: bool,
+    /// Write an animation (APNG) of the first trials, failures first.
+    #[arg(long, value_name = "FILE")]
+    video: Option<PathBuf>,
+    /// Trials in the animation.
+    #[arg(long, default_value_t = 6)]
+    filmed: usize,
+    /// Threads (by default one a core); never changes a result.
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+fn main() -> anyhow::Result<()> {
+    let a = Arguments::parse();
+    if let Some(n) = a.threads {
+        auto_e2h::learn::set_threads(n)?;
+    }
+    let published = Published::open(&a.checkpoint)?;
+    let parallel = published.config.evaluation.parallel.min(a.trials);
+    let progress = Progress::new(a.json);
+    let (policy, direction) = (&published.policy, published.direction);
+    let (result, trials) =
+        evaluate(published.envs(parallel)?, policy, direction, a.trials, a.seed, &progress)?;
+
+    if let Some(path) = &a.video {
+        let mut order: Vec<usize> = (0..trials.len()).collect();
+        order.sort_by_key(|&i| trials[i].outcome.is_success());
+        order.truncate(a.filmed);
+        let mut env = published.envs(1)?.pop().context("no simulation")?;
+        let films = film(&mut env, policy, direction, &order, a.seed, "table", 200)?;
+        let (outcomes, frames): (Vec<_>, Vec<_>) = films.into_iter().unzip();
+        report::animation::write_apng(path, &report::animation::tile(&frames, &outcomes, 3), 10)?;
+    }
+
+    let task = &published.checkpoint.provenance.task;
+    if a.json {
+        let line = serde_json::json!({
+            "task": task,
+            "trials": result.trials,
+            "successes": result.successes,
+            "wilson95": result.wilson95,
+            "seconds": result.seconds,
+        });
+        println!("{line}");
+    } else {
+        let [lo, hi] = result.wilson95;
+        println!(
+            "{task} ({direction}): {} of {} trials succeeded, 95 % Wilson interval {:.0} to {:.0} %, {:.0} s",
+            result.successes,
+            result.trials,
+            lo * 100.0,
+            hi * 100.0,
+            result.seconds
+        );
+    }
+    Ok(())
+}

@@ -1,0 +1,94 @@
+use std::path::{Path, PathBuf};
+
+fn crates() -> Vec<(String, PathBuf)> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("crates");
+    let mut found: Vec<_> = std::fs::read_dir(folder)
+        .unwrap()
+        .flatten()
+        .filter(|e| e.path().join("Cargo.toml").exists())
+        .map(|e| (e.file_name().to_string_lossy().into_owned(), e.path()))
+        .collect();
+    found.sort();
+    found
+}
+
+fn sources(dir: &Path, out: &mut Vec<PathBuf>) {
+    for entry in std::fs::read_dir(dir).unwrap().flatten() {
+        let path = entry.path();
+        if path.is_dir() {
+            sources(&path, out);
+        } else if path.extension().is_some_and(|e| e == "rs") {
+            out.push(path);
+        }
+    }
+}
+
+fn dependencies(path: &Path) -> Vec<String> {
+    let table: toml::Table = std::fs::read_to_string(path.join("Cargo.toml")).unwrap().parse().unwrap();
+    let section = table.get("dependencies").and_then(toml::Value::as_table);
+    section.map(|t| t.keys().cloned().collect()).unwrap_or_default()
+}
+
+#[test]
+fn only_the_crates_that_may_name_candle_or_mujoco_do() {
+    for (name, path) in crates() {
+        for dependency in dependencies(&path) {
+            if dependency.starts_with("candle") {
+                assert!(["nn", "policy"].contains(&name.as_str()), "{name} depends on {dependency}");
+            }
+            if dependency == "mujoco-rs" {
+                assert_eq!(name, "env", "{name} depends on {dependency}");
+            }
+        }
+    }
+}
+
+#[test]
+fn core_and_refine_stand_on_nothing_heavy() {
+    for (name, path) in crates() {
+        let found = dependencies(&path);
+        let own: Vec<&String> = found.iter().filter(|d| d.starts_with("e2h-") || *d == "mujoco-native").collect();
+        match name.as_str() {
+            "core" | "nn" => assert!(own.is_empty(), "{name} depends on {own:?}"),
+            "refine" | "data" => assert_eq!(own, ["e2h-core"], "{name}"),
+            _ => {}
+        }
+    }
+}
+
+#[test]
+fn methods_name_no_task_and_tasks_no_method() {
+    for (name, path) in crates() {
+        let words: &[&str] = match name.as_str() {
+            "learn" | "policy" | "refine" | "data" => &["nut_assembly::", "NutAssembly"],
+            "env" => &["e2h_policy", "e2h_learn", "e2h_nn"],
+            _ => continue,
+        };
+        let mut files = vec![];
+        sources(&path.join("src"), &mut files);
+        for file in files {
+            let text = std::fs::read_to_string(&file).unwrap();
+            for word in words {
+                assert!(!text.contains(word), "{} names {word}", file.display());
+            }
+        }
+    }
+}
+
+#[test]
+fn libraries_do_not_unwrap() {
+    for (name, path) in crates() {
+        let mut files = vec![];
+        sources(&path.join("src"), &mut files);
+        for file in files {
+            let text = std::fs::read_to_string(&file).unwrap();
+            // Tests inside a file come last by convention.
+            let code = text.split("#[cfg(test)]").next().unwrap_or_default();
+            for (i, line) in code.lines().enumerate() {
+                let line = line.trim_start();
+                let found = !line.starts_with("//") && (line.contains(".unwrap()") || line.contains(".expect("));
+                assert!(!found, "{name}: {}:{}", file.display(), i + 1);
+            }
+        }
+    }
+}

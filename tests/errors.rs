@@ -1,0 +1,95 @@
+use crate::{SMALL, assert_same_results, assert_success, example, nut_assembly, text};
+use std::process::Command;
+
+fn fails(command: &mut Command, words: &[&str]) {
+    let output = command.output().unwrap();
+    let message = text(&output.stderr);
+    assert!(!output.status.success(), "{message}");
+    for word in words {
+        assert!(message.contains(word), "expected `{word}` in: {message}");
+    }
+}
+
+#[test]
+fn wrong_configuration_is_refused_before_any_work() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    fails(&mut nut_assembly(&out, &["--set", "loop.cycle=3"]), &["loop.cycle", "did you mean `loop.cycles`"]);
+    fails(&mut nut_assembly(&out, &["--set", "loop.cycles=few"]), &["loop.cycles", "integer", "few"]);
+    fails(&mut nut_assembly(&out, &["--set", "policy.horizon=15"]), &["horizon", "multiple of 2", "15"]);
+    fails(&mut nut_assembly(&out, &["--set", "task.variant=rund"]), &["rund", "round"]);
+    fails(&mut nut_assembly(&out, &["--device", "cuda"]), &["CPU only"]);
+    fails(&mut nut_assembly(&out, &["--threads", "0"]), &["threads", "at least 1"]);
+    assert!(!out.exists(), "a refused run left a folder");
+}
+
+#[test]
+fn a_run_directory_is_never_overwritten() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    assert_success(&nut_assembly(&out, &["--set=loop.iterations=0"]).output().unwrap());
+    fails(&mut nut_assembly(&out, &["--set=loop.iterations=0"]), &["exists", "--resume"]);
+    fails(&mut nut_assembly(&out, &["--resume", "--set=loop.iterations=1"]), &["config.toml", "expected", "found"]);
+    fails(
+        &mut nut_assembly(&out, &["--resume", "--set=loop.iterations=0", "--seed", "9"]),
+        &["run", "seed 9", "seed 0"],
+    );
+
+    let other = dir.path().join("holiday");
+    std::fs::create_dir(&other).unwrap();
+    std::fs::write(other.join("photo.jpg"), "mine").unwrap();
+    fails(&mut nut_assembly(&other, &["--resume"]), &["exists"]);
+
+    // Foreign and damaged checkpoints.
+    let evaluate = |checkpoint: &std::path::Path| {
+        let mut command = example("evaluate");
+        command.args(["--trials", "1", "--checkpoint"]).arg(checkpoint);
+        command
+    };
+    fails(&mut evaluate(&other), &["policy.json"]);
+    let policy = out.join("iteration_00/policy");
+    let json = std::fs::read_to_string(policy.join("policy.json")).unwrap();
+    std::fs::write(policy.join("policy.json"), json.replace("\"format\": 1", "\"format\": 99")).unwrap();
+    fails(&mut evaluate(&policy), &["expected format 1", "found 99"]);
+    std::fs::write(policy.join("policy.json"), &json).unwrap();
+    let weights = policy.join("model.safetensors");
+    let mut bytes = std::fs::read(&weights).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    std::fs::write(&weights, bytes).unwrap();
+    fails(&mut evaluate(&policy), &["SHA-256"]);
+}
+
+#[test]
+fn a_loss_that_is_no_number_stops_the_run_with_step_and_seed() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    let arguments =
+        ["--set=train.step.schedule.lr=1e30", "--set=train.step.schedule.warmup=0", "--set=train.step.adam.clip_norm=0.0"];
+    fails(&mut nut_assembly(&out, &arguments), &["step", "seed 0", "loss"]);
+    assert!(out.join("demonstrations").exists(), "what was made before is lost");
+}
+
+/// A limit on the size of a file, with its signal ignored, makes writes fail as a full disk does.
+#[cfg(unix)]
+#[test]
+fn a_full_disk_leaves_nothing_half_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let (whole, full) = (dir.path().join("whole"), dir.path().join("full"));
+    assert_success(&nut_assembly(&whole, &[]).output().unwrap());
+    let program = example("nut_assembly").get_program().to_owned();
+    for kilobytes in [16, 200, 400] {
+        let mut command = Command::new("bash");
+        command
+            .arg("-c")
+            .arg(format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$@\""))
+            .arg("bash")
+            .arg(&program)
+            .args(["--preset", "smoke", "--quiet", "--resume", "--out"])
+            .arg(&full)
+            .args(SMALL);
+        fails(&mut command, &["File too large"]);
+    }
+    assert_success(&nut_assembly(&full, &["--resume"]).output().unwrap());
+    assert_same_results(&whole, &full);
+}

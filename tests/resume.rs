@@ -1,0 +1,45 @@
+use crate::{assert_same_results, assert_success, nut_assembly};
+use rand::{Rng as _, SeedableRng as _};
+use std::time::{Duration, Instant};
+
+#[test]
+fn a_run_killed_at_random_instants_ends_with_the_same_bytes_whatever_the_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    let (whole, killed) = (dir.path().join("whole"), dir.path().join("killed"));
+    let start = Instant::now();
+    assert_success(&nut_assembly(&whole, &["--threads", "1"]).output().unwrap());
+    let whole_run = start.elapsed();
+
+    // Seeded, so that a failure can be tried again; the instants still vary with the machine's speed.
+    let mut rng = rand::rngs::StdRng::seed_from_u64(7);
+    let mut kills = 0;
+    for attempt in 0..40 {
+        let threads = ["1", "2", "3"][attempt % 3];
+        let mut child = nut_assembly(&killed, &["--resume", "--threads", threads])
+            .stdout(std::process::Stdio::null())
+            .spawn()
+            .unwrap();
+        let limit = if attempt < 6 { whole_run.mul_f64(rng.random_range(0.02..0.6)) } else { Duration::MAX };
+        let begun = Instant::now();
+        let status = loop {
+            if let Some(status) = child.try_wait().unwrap() {
+                break Some(status);
+            }
+            if begun.elapsed() > limit {
+                child.kill().unwrap();
+                child.wait().unwrap();
+                break None;
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        };
+        match status {
+            Some(status) => {
+                assert!(status.success(), "a resumed run failed");
+                break;
+            }
+            None => kills += 1,
+        }
+    }
+    assert!(kills >= 2, "the run was never killed");
+    assert_same_results(&whole, &killed);
+}

@@ -21,24 +21,26 @@ pub(crate) fn exp<const FMA: bool>(x: f32) -> f32 {
     f32::from_bits(((n as i32 + 127) as u32) << 23) * y
 }
 
-/// x tanh(softplus(x)) = x n / (n + 2) with n = e^x (e^x + 2). From x = 30 on the quotient is 1 in `f32`, and the clamp
-/// keeps n finite.
+/// Where Mish is 0 and where it is x, in `f32`. Clamped there, no product overflows.
+const ENDS: (f32, f32) = (-87.0, 30.0);
+
+/// x tanh(softplus(x)) = x n / (n + 2) with n = e^x (e^x + 2).
 #[inline(always)]
 pub(crate) fn mish<const FMA: bool>(x: f32) -> f32 {
-    let e = exp::<FMA>(x.min(30.0));
+    let e = exp::<FMA>(x.min(ENDS.1));
     let n = e * (e + 2.0);
-    x * (n / (n + 2.0))
+    x.max(ENDS.0) * (n / (n + 2.0))
 }
 
 /// Value and derivative of [`mish`].
 #[inline(always)]
 pub(crate) fn mish_both<const FMA: bool>(x: f32) -> (f32, f32) {
-    let e = exp::<FMA>(x.min(30.0));
+    let e = exp::<FMA>(x.min(ENDS.1));
     let n = e * (e + 2.0);
     let w = n / (n + 2.0);
     // 1 - w^2 = (1 - w)(1 + w), with 1 - w = 2 / (n + 2) free of cancellation.
     let d = (2.0 / (n + 2.0)) * (1.0 + w) * (e / (1.0 + e));
-    (x * w, fma::<FMA>(x, d, w))
+    (x.max(ENDS.0) * w, fma::<FMA>(x.clamp(ENDS.0, ENDS.1), d, w))
 }
 
 simd! {

@@ -95,14 +95,14 @@ impl Default for DemonstratorConfig {
             waypoint_noise_m: 0.004,
             waypoint_noise_rad: 0.03,
             bow: 0.08,
-            speed: [0.10, 0.22],
-            acceleration: 0.6,
-            pause_probability: 0.3,
+            speed: [0.10, 0.25],
+            acceleration: 1.0,
+            pause_probability: 0.25,
             pause_s: [0.2, 1.5],
             slow_probability: 0.25,
             slow_speed: [0.03, 0.05],
             slow_length_m: [0.02, 0.05],
-            grip_dwell_s: [0.4, 0.6],
+            grip_dwell_s: [0.35, 0.55],
             tail: 10,
         }
     }

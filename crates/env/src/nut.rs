@@ -62,7 +62,13 @@ impl Task for NutAssembly {
     }
 
     fn scene(&self) -> String {
-        let camera = TableCamera { position: [1.22, -0.62, 0.62], target: [0.56, -0.07, 0.03], fovy: 42.0 };
+        // From the side on which the peg stands, so that the arm does not hide it.
+        let [x, y] = self.variant.peg;
+        let camera = TableCamera {
+            position: [x + 0.46, y + 0.52 * y.signum(), 0.60],
+            target: [x - 0.17, y - 0.02 * y.signum(), 0.06],
+            fovy: 37.0,
+        };
         compose(&self.variant.bodies(), &camera)
     }
 

@@ -20,8 +20,9 @@ pub struct TableCamera {
 #[must_use]
 pub fn compose(bodies: &str, camera: &TableCamera) -> String {
     let table = camera_xml("table", camera.position, camera.target, [0.0, 0.0, 1.0], camera.fovy);
-    // In the frame of the hand z points to the fingertips; the camera looks past them at what they hold.
-    let wrist = camera_xml("wrist", [0.09, 0.0, -0.03], [0.0, 0.0, 0.115], [1.0, 0.0, 0.0], 68.0);
+    // In the frame of the hand z points to the fingertips and x forward. The camera hangs in front of the hand, so that the
+    // fingertips are at the lower edge of the image and what they hold above them.
+    let wrist = camera_xml("wrist", [0.11, 0.0, -0.03], [0.086, 0.0, 0.2], [1.0, 0.0, 0.0], 84.0);
     PANDA.replace("<!--CAMERAS-->", &table).replace("<!--WRIST-->", &wrist).replace("<!--TASK-->", bodies)
 }
 

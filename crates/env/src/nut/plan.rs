@@ -12,11 +12,11 @@ const GRASP_HEIGHT: f64 = 0.004;
 /// Height over the nut at which the hand comes and goes, m.
 const APPROACH: f64 = 0.09;
 /// Height of the nut's middle at which it passes over the peg, m.
-const TRANSIT: f64 = PEG_TOP + 0.035;
+const TRANSIT: f64 = PEG_TOP + 0.03;
 /// Gap under the nut when it is let go, m.
 const RELEASE_GAP: f64 = 0.001;
 /// Fraction of the drawn speed at which the hand goes down to things.
-const GENTLE: f64 = 0.7;
+const GENTLE: f64 = 0.8;
 /// Where over the peg the nut passes its top: spread from the middle, m.
 const ENTRY: f64 = 0.003;
 
@@ -92,7 +92,7 @@ pub(super) fn script(
         let [x, y] = target;
         let at = |z: f64| carry(sim, Vector3::new(x, y, z), goal_yaw);
         // What is on the peg is reached and left over the peg's top.
-        let over = PEG_TOP + 0.03;
+        let over = PEG_TOP + 0.02;
         let (come, leave) = match direction {
             Direction::Hard => (APPROACH, over),
             Direction::Easy => (over, APPROACH),

@@ -74,7 +74,7 @@ const LOOSE: Variant = Variant {
     start_y: [-0.2, -0.1],
     yaw: Yaw::Fixed,
     peg_yaw: 0.1,
-    home: [0.48, -0.12, 0.26],
+    home: [0.48, -0.12, 0.24],
     seat_xy: 0.05,
 };
 
@@ -90,7 +90,7 @@ const ROUND: Variant = Variant {
     start_x: [0.445, 0.45],
     start_y: [-0.225, -0.11],
     yaw: Yaw::Uniform,
-    home: [0.50, -0.14, 0.26],
+    home: [0.50, -0.14, 0.24],
     seat_xy: 0.03,
     ..LOOSE
 };
@@ -108,7 +108,7 @@ const SQUARE: Variant = Variant {
     start_x: [0.445, 0.45],
     start_y: [0.11, 0.225],
     yaw: Yaw::Quarters,
-    home: [0.50, 0.14, 0.26],
+    home: [0.50, 0.14, 0.24],
     seat_xy: 0.03,
     ..LOOSE
 };

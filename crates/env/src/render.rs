@@ -112,7 +112,7 @@ impl Renderer {
         }
         let (k, n) = self.hit[pixel];
         let shape = &self.shapes[usize::from(k)];
-        let n = shape.to_world(n);
+        let n = shape.world(n);
         let mut sun = dot(n, SUN).max(0.0);
         if style.shadows && sun > 0.0 {
             let point = add(add(eye.position, *ray, t), n, 1e-3);

@@ -1,4 +1,5 @@
 //! Cameras.
+#![allow(clippy::unwrap_used, reason = "tests")]
 
 use e2h_core::{Direction, Image, stream};
 use e2h_env::{Env, EnvConfig, Error, Style, TaskOptions, task};

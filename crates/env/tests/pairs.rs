@@ -1,4 +1,5 @@
 //! What every task pair and variant must hold.
+#![allow(clippy::unwrap_used, reason = "tests")]
 
 use e2h_core::{Action, Direction, Origin, Outcome, Pose, Rng, stream};
 use e2h_env::{

@@ -3,7 +3,7 @@
 use crate::expert::draw;
 use e2h_core::Rng;
 use rand::Rng as _;
-use std::f64::consts::{FRAC_1_SQRT_2, PI, TAU};
+use std::f64::consts::{PI, TAU};
 use std::fmt::Write as _;
 
 /// Half the thickness of every nut, m.
@@ -139,19 +139,11 @@ impl Variant {
             Shape::Round => {
                 for k in 0..8 {
                     let turn = f64::from(k) * TAU / 8.0;
-                    // Quarter turns exactly, so that the nut is as symmetric as its source.
-                    let (s, c) = match k % 8 {
-                        0 => (0.0, 1.0),
-                        2 => (1.0, 0.0),
-                        4 => (0.0, -1.0),
-                        6 => (-1.0, 0.0),
-                        _ => (FRAC_1_SQRT_2 * turn.sin().signum(), FRAC_1_SQRT_2 * turn.cos().signum()),
-                    };
-                    segment([thick, long], [self.ring * c, self.ring * s], turn);
+                    segment([thick, long], [self.ring * turn.cos(), self.ring * turn.sin()], turn);
                 }
             }
             Shape::Square => {
-                let short = self.ring + thick - 2.0 * thick + 0.0085; // 0.03125: robosuite's overlap at the corners
+                let short = 0.03125; // robosuite's: the walls overlap at the corners
                 for sign in [1.0, -1.0] {
                     segment([thick, long], [sign * self.ring, 0.0], 0.0);
                     segment([short, thick], [0.0, sign * self.ring], 0.0);

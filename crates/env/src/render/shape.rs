@@ -81,7 +81,7 @@ impl Shape {
     }
 
     /// A direction of the shape's frame in the world.
-    pub(super) fn to_world(&self, d: V) -> V {
+    pub(super) fn world(&self, d: V) -> V {
         let [x, y, z] = self.axes;
         add(add(x.map(|v| v * d[0]), y, d[1]), z, d[2])
     }
@@ -97,7 +97,7 @@ impl Shape {
         };
         Some(std::array::from_fn(|i| {
             let sign = |bit: usize| if i >> bit & 1 == 0 { -1.0 } else { 1.0 };
-            add(self.position, self.to_world([half[0] * sign(0), half[1] * sign(1), half[2] * sign(2)]), 1.0)
+            add(self.position, self.world([half[0] * sign(0), half[1] * sign(1), half[2] * sign(2)]), 1.0)
         }))
     }
 

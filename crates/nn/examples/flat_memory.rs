@@ -5,8 +5,8 @@
 
 use candle_core::{Device, Tensor};
 use e2h_nn::{
-    Adam, AdamConfig, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig,
-    backward, mse, repeat_rows,
+    Adam, AdamConfig, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, RgbEncoder, RgbEncoderConfig,
+    UnetConfig, backward, mse, repeat_rows,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

@@ -1,27 +1,42 @@
-//! Times of the networks, in milliseconds: `cargo run --release -p e2h-nn --example speed [threads]`.
+//! Times of the networks, in milliseconds: `cargo run --release -p e2h-nn --example speed [threads [part of a name]]`.
 #![allow(clippy::print_stdout, reason = "an example prints")]
 
 use candle_core::{Device, Tensor};
 use e2h_nn::{
-    Adam, AdamConfig, Builder, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, Result, RgbEncoder, RgbEncoderConfig,
-    UnetConfig, backward, mse,
+    Adam, AdamConfig, Builder, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, Result, RgbEncoder,
+    RgbEncoderConfig, UnetConfig, backward, mse,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::time::Instant;
 
-/// Least and middle of some runs, after two that warm up.
+/// Milliseconds that all threads of this process were on a processor, from `/proc` (zero elsewhere).
+fn cpu_ms() -> f64 {
+    let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
+    let stats = tasks.filter_map(|t| std::fs::read_to_string(t.path().join("schedstat")).ok());
+    stats.filter_map(|s| s.split_whitespace().next()?.parse::<f64>().ok()).sum::<f64>() / 1e6
+}
+
+/// Least and middle of some runs, after two that warm up, and their mean processor time.
 fn time(what: &str, runs: usize, mut f: impl FnMut() -> Result<()>) -> Result<()> {
+    if std::env::args().nth(2).is_some_and(|part| !what.contains(&part)) {
+        return Ok(());
+    }
     let mut all = Vec::with_capacity(runs);
+    let mut cpu = 0.0;
     for i in 0..runs + 2 {
+        if i == 2 {
+            cpu = cpu_ms();
+        }
         let start = Instant::now();
         f()?;
         if i > 1 {
             all.push(start.elapsed().as_secs_f64() * 1e3);
         }
     }
+    let cpu = (cpu_ms() - cpu) / runs as f64;
     all.sort_by(f64::total_cmp);
-    println!("{what:<60} least {:8.2}  middle {:8.2}", all[0], all[all.len() / 2]);
+    println!("{what:<60} least {:8.2}  middle {:8.2}  processor {cpu:8.2}", all[0], all[all.len() / 2]);
     Ok(())
 }
 

@@ -25,7 +25,9 @@ pub enum Error {
         found: String,
     },
     /// Weights that do not belong to these parameters. Nothing was changed.
-    #[error("weights do not fit: missing {missing:?}, unexpected {unexpected:?}, of another shape {misshaped:?}")]
+    #[error(
+        "weights do not fit: missing {missing:?}, unexpected {unexpected:?}, of another shape {misshaped:?}"
+    )]
     Import {
         /// Parameters that the weights lack.
         missing: Vec<String>,

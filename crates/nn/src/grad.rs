@@ -95,7 +95,8 @@ impl Grads {
     /// [`Error::OtherParams`] when they are of another network.
     pub fn export(&self, params: &Params) -> Result<Weights> {
         self.check(params)?;
-        let full = |(g, v): (&Option<Vec<f32>>, &candle_core::Var)| g.clone().unwrap_or(vec![0.0; v.elem_count()]);
+        let full =
+            |(g, v): (&Option<Vec<f32>>, &candle_core::Var)| g.clone().unwrap_or(vec![0.0; v.elem_count()]);
         let list: Vec<Vec<f32>> = self.list.iter().zip(params.variables()).map(full).collect();
         Ok(params.all_outward(&list))
     }

@@ -45,8 +45,8 @@ mod weights;
 pub use error::{Error, Result};
 pub use grad::{Grads, backward, backward_many, no_grad};
 pub use layers::{
-    Act, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Relu, SpatialSoftmax, dropout,
-    repeat_rows, sinusoidal_embedding,
+    Act, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Relu, SpatialSoftmax,
+    dropout, repeat_rows, sinusoidal_embedding,
 };
 pub use loss::mse;
 pub use memory::tune_allocator;

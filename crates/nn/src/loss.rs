@@ -41,7 +41,11 @@ impl Step for MseStep {
 /// [`Error::Shape`] when the shapes differ, [`Error::Config`] when no row counts.
 pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Result<Tensor> {
     let dims = prediction.dims();
-    let wrong = |what, expected: String, found: &Tensor| Error::Shape { what, expected, found: found.dims().to_vec() };
+    let wrong = |what, expected: String, found: &Tensor| Error::Shape {
+        what,
+        expected,
+        found: found.dims().to_vec(),
+    };
     if target.dims() != dims || dims.is_empty() {
         return Err(wrong("target of the loss", format!("{dims:?}"), target));
     }
@@ -58,11 +62,16 @@ pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Res
     let count = rows * width as f64;
     if count.is_nan() || count <= 0.0 {
         let found = format!("{count}");
-        return Err(Error::Config { what: "numbers that count in the loss", expected: "at least one", found });
+        return Err(Error::Config {
+            what: "numbers that count in the loss",
+            expected: "at least one",
+            found,
+        });
     }
     run(&[prediction, target], None, |tape, n| {
         let (p, t) = (tape.read(n[0])?, tape.read(n[1])?);
-        let square = |p: &[f32], t: &[f32]| p.iter().zip(t).map(|(p, t)| f64::from(p - t).powi(2)).sum::<f64>();
+        let square =
+            |p: &[f32], t: &[f32]| p.iter().zip(t).map(|(p, t)| f64::from(p - t).powi(2)).sum::<f64>();
         let sum = if weights.is_empty() {
             square(&p, &t)
         } else {

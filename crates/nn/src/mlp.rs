@@ -22,7 +22,11 @@ impl Mlp {
     pub fn new(dims: &[usize], dropout: f32, builder: &Builder<'_>) -> Result<Self> {
         if dims.len() < 2 {
             let found = format!("{dims:?}");
-            return Err(Error::Config { what: "sizes of an mlp", expected: "at least input and output", found });
+            return Err(Error::Config {
+                what: "sizes of an mlp",
+                expected: "at least input and output",
+                found,
+            });
         }
         if !(0.0..1.0).contains(&dropout) {
             let expected = "a probability in [0, 1)";
@@ -49,7 +53,9 @@ impl Mlp {
             let (p, keep) = (self.dropout, 1.0 / (1.0 - self.dropout));
             for layer in &self.layers[..self.layers.len() - 1] {
                 let n = rows * layer.out_dim();
-                masks.push((0..n).map(|_| if rng.random::<f32>() < p { 0.0 } else { keep }).collect::<Vec<f32>>());
+                masks.push(
+                    (0..n).map(|_| if rng.random::<f32>() < p { 0.0 } else { keep }).collect::<Vec<f32>>(),
+                );
             }
         }
         run(&[x], Some(first.anchor()), |t, n| {

@@ -121,8 +121,12 @@ impl Params {
         rng: &mut ChaCha8Rng,
         f: impl FnOnce(&Builder<'_>) -> Result<T>,
     ) -> Result<(Self, T)> {
-        let shared =
-            Shared { mode, rng: RefCell::new(rng.clone()), params: RefCell::default(), duplicate: Cell::default() };
+        let shared = Shared {
+            mode,
+            rng: RefCell::new(rng.clone()),
+            params: RefCell::default(),
+            duplicate: Cell::default(),
+        };
         let built = f(&Builder { shared: &shared, path: String::new() })?;
         *rng = shared.rng.into_inner();
         if let Some(name) = shared.duplicate.take() {
@@ -182,14 +186,18 @@ impl Params {
 
     /// Fails with the list of differences unless `weights` has these names and shapes.
     pub(crate) fn matches(&self, weights: &Weights) -> Result<()> {
-        let missing: Vec<String> = self.params.keys().filter(|n| !weights.contains_key(*n)).cloned().collect();
-        let unexpected: Vec<String> = weights.keys().filter(|n| !self.params.contains_key(*n)).cloned().collect();
+        let missing: Vec<String> =
+            self.params.keys().filter(|n| !weights.contains_key(*n)).cloned().collect();
+        let unexpected: Vec<String> =
+            weights.keys().filter(|n| !self.params.contains_key(*n)).cloned().collect();
         let fits = |p: &Param, t: &HostTensor| p.shape == t.shape && t.data.len() == p.var.elem_count();
         let misshaped: Vec<String> = self
             .params
             .iter()
             .filter_map(|(n, p)| weights.get(n).filter(|t| !fits(p, t)).map(|t| (n, p, t)))
-            .map(|(n, p, t)| format!("{n}: expected {:?}, found {:?} with {} numbers", p.shape, t.shape, t.data.len()))
+            .map(|(n, p, t)| {
+                format!("{n}: expected {:?}, found {:?} with {} numbers", p.shape, t.shape, t.data.len())
+            })
             .collect();
         if missing.is_empty() && unexpected.is_empty() && misshaped.is_empty() {
             return Ok(());

@@ -35,14 +35,22 @@ impl RgbEncoderConfig {
             return fail("base_width", "a positive multiple of 16", self.base_width.to_string());
         }
         if self.stage_blocks.is_empty() || self.stage_blocks.contains(&0) {
-            return fail("stage_blocks", "at least one stage of at least one block", format!("{:?}", self.stage_blocks));
+            return fail(
+                "stage_blocks",
+                "at least one stage of at least one block",
+                format!("{:?}", self.stage_blocks),
+            );
         }
         if self.keypoints == 0 || self.feature_dim == 0 {
             let found = format!("{} and {}", self.keypoints, self.feature_dim);
             return fail("keypoints and feature_dim", "positive numbers", found);
         }
         if self.height == 0 || self.width == 0 {
-            return fail("height and width", "positive numbers", format!("{} and {}", self.height, self.width));
+            return fail(
+                "height and width",
+                "positive numbers",
+                format!("{} and {}", self.height, self.width),
+            );
         }
         Ok(())
     }

@@ -1,4 +1,6 @@
-use crate::layers::{Act, Conv1d, ConvTranspose1d, Extra, GroupNorm, Linear, concat, mish, sinusoidal_embedding};
+use crate::layers::{
+    Act, Conv1d, ConvTranspose1d, Extra, GroupNorm, Linear, concat, mish, sinusoidal_embedding,
+};
 use crate::params::Builder;
 use crate::tape::{Node, Tape, run};
 use crate::{Error, Result};

@@ -71,8 +71,11 @@ pub fn save_weights(
 /// type.
 pub fn load_weights(path: impl AsRef<Path>) -> Result<(Weights, BTreeMap<String, String>)> {
     let path = path.as_ref();
-    let bytes =
-        std::fs::read(path).map_err(|source| Error::Io { doing: "reading", path: path.to_path_buf(), source })?;
+    let bytes = std::fs::read(path).map_err(|source| Error::Io {
+        doing: "reading",
+        path: path.to_path_buf(),
+        source,
+    })?;
     let not = |e: safetensors::SafeTensorError| Error::File {
         path: path.to_path_buf(),
         expected: "a safetensors file",
@@ -89,7 +92,8 @@ pub fn load_weights(path: impl AsRef<Path>) -> Result<(Weights, BTreeMap<String,
                 found: format!("`{name}` of type {:?}", view.dtype()),
             });
         }
-        let data = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+        let data =
+            view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
         weights.insert(name, HostTensor { shape: view.shape().to_vec(), data });
     }
     Ok((weights, metadata))

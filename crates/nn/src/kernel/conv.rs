@@ -243,15 +243,8 @@ fn spread(g: &Geo, bias: Option<&[f32]>, product: impl Fn(usize, usize, &mut [f3
 pub(crate) fn input_grad(w: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
     let (n, k) = (g.n, g.k());
     if g.sh == 1 && g.sw == 1 && g.ph < g.kh && g.pw < g.kw {
-        let back = Geo {
-            h: g.out_h(),
-            w: g.out_w(),
-            c: n,
-            n: g.c,
-            ph: g.kh - 1 - g.ph,
-            pw: g.kw - 1 - g.pw,
-            ..*g
-        };
+        let back =
+            Geo { h: g.out_h(), w: g.out_w(), c: n, n: g.c, ph: g.kh - 1 - g.ph, pw: g.kw - 1 - g.pw, ..*g };
         return forward(dy, &flipped(w, g), None, &back);
     }
     let mut wt = scratch(w.len());

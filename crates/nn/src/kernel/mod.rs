@@ -3,7 +3,10 @@
 //!
 //! Work is cut by the sizes of the data, never by the number of threads, and partial sums are added in that fixed order:
 //! the same inputs give the same bytes in any pool.
-#![allow(unsafe_code, reason = "gemm takes pointers, and AVX2 code must be called behind a check of the processor")]
+#![allow(
+    unsafe_code,
+    reason = "gemm takes pointers, and AVX2 code must be called behind a check of the processor"
+)]
 
 pub(crate) mod act;
 pub(crate) mod conv;
@@ -105,12 +108,20 @@ impl<'a> Mat<'a> {
 ///
 /// `spread` lets the threads of the pool share the product. Each element is still one sum in the order of `k`, so the
 /// result does not depend on it.
-pub(crate) fn matmul(dims: (usize, usize, usize), c: &mut [f32], add: bool, a: Mat<'_>, b: Mat<'_>, spread: bool) {
+pub(crate) fn matmul(
+    dims: (usize, usize, usize),
+    c: &mut [f32],
+    add: bool,
+    a: Mat<'_>,
+    b: Mat<'_>,
+    spread: bool,
+) {
     let (m, n, k) = dims;
     if m == 0 || n == 0 {
         return;
     }
-    let fits = |x: Mat<'_>, r: usize, q: usize| r == 0 || q == 0 || (r - 1) * x.row + (q - 1) * x.col < x.data.len();
+    let fits =
+        |x: Mat<'_>, r: usize, q: usize| r == 0 || q == 0 || (r - 1) * x.row + (q - 1) * x.col < x.data.len();
     assert!(c.len() >= m * n && fits(a, m, k) && fits(b, k, n), "matrix product outside its slices");
     let many = if spread { threads() } else { 1 };
     let parallelism = if many > 1 { Parallelism::Rayon(many) } else { Parallelism::None };
@@ -185,7 +196,8 @@ pub(crate) fn column_sums(rows: &[f32], n: usize) -> Vec<f32> {
     }
     let chunks = rows.len().div_ceil(ROWS * n);
     let mut parts = vec![0.0; chunks * n];
-    let part = |i: usize, p: &mut [f32]| add_rows(p, &rows[i * ROWS * n..((i + 1) * ROWS * n).min(rows.len())]);
+    let part =
+        |i: usize, p: &mut [f32]| add_rows(p, &rows[i * ROWS * n..((i + 1) * ROWS * n).min(rows.len())]);
     if worthwhile(rows.len()) {
         parts.par_chunks_mut(n).enumerate().for_each(|(i, p)| part(i, p));
     } else {

@@ -174,22 +174,23 @@ impl Lanes {
 
     /// z = a x + b from mean and reciprocal deviation of each group.
     fn set(&mut self, d: &Dims, stats: &[f32], gamma: &[f32], beta: &[f32]) {
-        let per = d.c / d.groups;
-        for i in 0..self.a.len() {
-            let c = i % d.c;
-            let (m, r) = (stats[c / per * 2], stats[c / per * 2 + 1]);
-            (self.mean[i], self.rs[i]) = (m, r);
-            self.a[i] = r * gamma[c];
-            self.b[i] = beta[c] - m * self.a[i];
+        let (per, l) = (d.c / d.groups, self.a.len());
+        for (g, st) in stats.chunks_exact(2).take(d.groups).enumerate() {
+            for c in g * per..(g + 1) * per {
+                (self.mean[c], self.rs[c]) = (st[0], st[1]);
+                self.a[c] = st[1] * gamma[c];
+                self.b[c] = beta[c] - st[0] * self.a[c];
+            }
+        }
+        for v in [&mut self.a, &mut self.b, &mut self.mean, &mut self.rs] {
+            (d.c..l).step_by(d.c).for_each(|at| v.copy_within(..d.c, at));
         }
     }
 
     /// Repeats scale and shift of a sample over the lanes.
     fn set_film(&mut self, d: &Dims, e: &[f32]) {
-        let l = self.a.len();
-        for i in 0..l {
-            self.extra[i] = e[i % d.c];
-            self.extra[l + i] = e[d.c + i % d.c];
+        for (half, e) in self.extra.chunks_exact_mut(self.a.len()).zip(e.chunks_exact(d.c)) {
+            half.chunks_exact_mut(d.c).for_each(|h| h.copy_from_slice(e));
         }
     }
 }
@@ -302,7 +303,9 @@ pub(crate) fn backward(v: &Saved<'_>, dy: &mut [f32], post: Post, d: &Dims) -> B
         let (per, count) = (d.c / d.groups, (d.c / d.groups * d.s) as f32);
         for g in 0..d.groups {
             let r = g * per..(g + 1) * per;
-            let dot = |p: &[f32]| p[r.clone()].iter().zip(&v.gamma[r.clone()]).map(|(a, b)| a * b).sum::<f32>() / count;
+            let dot = |p: &[f32]| {
+                p[r.clone()].iter().zip(&v.gamma[r.clone()]).map(|(a, b)| a * b).sum::<f32>() / count
+            };
             let (m1, m2) = (dot(pb), dot(pg));
             for row in 0..l / d.c {
                 for i in row * d.c + r.start..row * d.c + r.end {

@@ -38,62 +38,60 @@ fn under(m: &Map, oy: usize, ox: usize, tap: usize) -> Option<usize> {
 }
 
 simd! {
-fn max_sample(x: &[f32], y: &mut [f32], at: &mut [u8], m: &Map) {
+fn max_sample(x: &[f32], y: &mut [f32], m: &Map) {
     let _ = FMA;
     let (p, c) = (m.pooled(), m.c);
-    for (o, (y, at)) in y.chunks_exact_mut(c).zip(at.chunks_exact_mut(c)).enumerate() {
+    for (o, y) in y.chunks_exact_mut(c).enumerate() {
         y.fill(f32::NEG_INFINITY);
-        at.fill(0);
+        let (oy, ox) = (o / p.w, o % p.w);
         for tap in 0..K * K {
-            let Some(s) = under(m, o / p.w, o % p.w, tap) else { continue };
-            let x = &x[s..s + c];
-            for i in 0..c {
-                let more = x[i] > y[i] || x[i].is_nan();
-                y[i] = if more { x[i] } else { y[i] };
-                at[i] = if more { tap as u8 } else { at[i] };
+            let Some(s) = under(m, oy, ox, tap) else { continue };
+            for (y, x) in y.iter_mut().zip(&x[s..s + c]) {
+                // A NaN, once met, stays.
+                *y = if *y >= *x { *y } else { *x };
             }
         }
     }
 }
 }
 simd! {
-fn max_sample_back(dy: &[f32], at: &[u8], dx: &mut [f32], m: &Map) {
+/// `left` is scratch of a row: what of the gradient no position has taken yet.
+fn max_sample_back(x: &[f32], y: &[f32], dy: &[f32], dx: &mut [f32], left: &mut [f32], m: &Map) {
     let _ = FMA;
     let (p, c) = (m.pooled(), m.c);
     dx.fill(0.0);
-    for (o, (dy, at)) in dy.chunks_exact(c).zip(at.chunks_exact(c)).enumerate() {
+    for (o, (y, dy)) in y.chunks_exact(c).zip(dy.chunks_exact(c)).enumerate() {
+        left.copy_from_slice(dy);
+        let (oy, ox) = (o / p.w, o % p.w);
         for tap in 0..K * K {
-            let Some(s) = under(m, o / p.w, o % p.w, tap) else { continue };
-            let dx = &mut dx[s..s + c];
+            let Some(s) = under(m, oy, ox, tap) else { continue };
+            let (x, dx, left) = (&x[s..s + c], &mut dx[s..s + c], &mut left[..c]);
             for i in 0..c {
-                dx[i] += if at[i] == tap as u8 { dy[i] } else { 0.0 };
+                let here = if x[i] == y[i] { left[i] } else { 0.0 };
+                dx[i] += here;
+                left[i] -= here;
             }
         }
     }
 }
 }
 
-/// The largest of every 3x3 window, step 2, border 1, and the tap it came from. Of equal ones the first counts.
-pub(crate) fn max_forward(x: &[f32], m: &Map) -> (Vec<f32>, Vec<u8>) {
+/// The largest of every 3x3 window, step 2, border 1.
+pub(crate) fn max_forward(x: &[f32], m: &Map) -> Vec<f32> {
     let size = m.pooled().size();
     let mut y = scratch(m.b * size);
-    let mut at = vec![0; m.b * size];
-    let one = |i: usize, y: &mut [f32], at: &mut [u8]| max_sample(&x[i * m.size()..][..m.size()], y, at, m);
-    if m.b > 1 && worthwhile(x.len()) {
-        y.par_chunks_mut(size)
-            .zip(at.par_chunks_mut(size))
-            .enumerate()
-            .for_each(|(i, (y, at))| one(i, y, at));
-    } else {
-        y.chunks_mut(size).zip(at.chunks_mut(size)).enumerate().for_each(|(i, (y, at))| one(i, y, at));
-    }
-    (y, at)
+    each(&mut y, size, |i, y| max_sample(&x[i * m.size()..][..m.size()], y, m));
+    y
 }
 
-pub(crate) fn max_backward(dy: &[f32], at: &[u8], m: &Map) -> Vec<f32> {
-    let size = m.pooled().size();
-    let mut dx = scratch(m.b * m.size());
-    each(&mut dx, m.size(), |i, dx| max_sample_back(&dy[i * size..][..size], &at[i * size..][..size], dx, m));
+/// The gradient of the input `x` with result `y`. Of equal maxima the first takes it.
+pub(crate) fn max_backward(x: &[f32], y: &[f32], dy: &[f32], m: &Map) -> Vec<f32> {
+    let (full, size) = (m.size(), m.pooled().size());
+    let mut dx = scratch(m.b * full);
+    each(&mut dx, full, |i, dx| {
+        let (x, at) = (&x[i * full..][..full], i * size..(i + 1) * size);
+        max_sample_back(x, &y[at.clone()], &dy[at], dx, &mut vec![0.0; m.c], m);
+    });
     dx
 }
 

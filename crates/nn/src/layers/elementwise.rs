@@ -235,7 +235,11 @@ pub fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
     let (b, width) = match x.dims() {
         [b, c] if *c > 0 => (*b, *c),
         found => {
-            return Err(Error::Shape { what: "rows to repeat", expected: "(B, C)".into(), found: found.to_vec() });
+            return Err(Error::Shape {
+                what: "rows to repeat",
+                expected: "(B, C)".into(),
+                found: found.to_vec(),
+            });
         }
     };
     if times == 0 {

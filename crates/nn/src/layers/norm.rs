@@ -49,10 +49,20 @@ impl GroupNorm {
     pub fn new(groups: usize, channels: usize, act: Act, builder: &Builder<'_>) -> Result<Self> {
         if channels == 0 || groups == 0 || !channels.is_multiple_of(groups) {
             let found = format!("{channels} channels in {groups} groups");
-            return Err(Error::Config { what: "group norm", expected: "channels divisible by the groups", found });
+            return Err(Error::Config {
+                what: "group norm",
+                expected: "channels divisible by the groups",
+                found,
+            });
         }
         let gain = builder.weight("weight", &[channels], None, Init::Ones)?;
-        Ok(Self { gain, bias: builder.weight("bias", &[channels], None, Init::Zeros)?, groups, channels, act })
+        Ok(Self {
+            gain,
+            bias: builder.weight("bias", &[channels], None, Init::Zeros)?,
+            groups,
+            channels,
+            act,
+        })
     }
 
     /// act(norm(x) + residual).
@@ -72,7 +82,8 @@ impl GroupNorm {
 
     pub(crate) fn record(&self, tape: &mut Tape, x: Node, extra: Extra) -> Result<Node> {
         let shape = tape.shape(x).to_vec();
-        let wrong = |what, expected: String, found: &[usize]| Error::Shape { what, expected, found: found.to_vec() };
+        let wrong =
+            |what, expected: String, found: &[usize]| Error::Shape { what, expected, found: found.to_vec() };
         if shape.len() < 2 || shape.last() != Some(&self.channels) || shape.contains(&0) {
             return Err(wrong("group norm input", format!("(B, .., {})", self.channels), &shape));
         }
@@ -85,7 +96,11 @@ impl GroupNorm {
             (Act::Mish, Extra::Film(e)) => (Post::MishFilm, Some(e)),
             (act, _) => {
                 let expected = "a residual only before Relu, or after Mish inside a U-Net block";
-                return Err(Error::Config { what: "group norm residual", expected, found: format!("{act:?}") });
+                return Err(Error::Config {
+                    what: "group norm residual",
+                    expected,
+                    found: format!("{act:?}"),
+                });
             }
         };
         let expected = if post == Post::MishFilm { vec![shape[0], 2 * self.channels] } else { shape.clone() };

@@ -32,21 +32,23 @@ impl MaxPool2d {
 
     pub(crate) fn record(self, tape: &mut Tape, x: Node) -> Result<Node> {
         let map = map(tape, x, "max pool input")?;
-        let (y, at) = pool::max_forward(&tape.read(x)?, &map);
+        let y = pool::max_forward(&tape.read(x)?, &map);
         let p = map.pooled();
-        Ok(tape.push(y, [p.b, p.h, p.w, p.c], &[x], &[], Pooled { x, at, map }))
+        let step = Pooled { x, y: tape.next(), map };
+        Ok(tape.push(y, [p.b, p.h, p.w, p.c], &[x], &[], step))
     }
 }
 
 struct Pooled {
     x: Node,
-    at: Vec<u8>,
+    y: Node,
     map: Map,
 }
 
 impl Step for Pooled {
-    fn backward(&self, _: &Values<'_>, dy: Vec<f32>, flow: &mut Flow) -> Result<()> {
-        flow.add(self.x, pool::max_backward(&dy, &self.at, &self.map));
+    fn backward(&self, values: &Values<'_>, dy: Vec<f32>, flow: &mut Flow) -> Result<()> {
+        let dx = pool::max_backward(&values.read(self.x)?, &values.read(self.y)?, &dy, &self.map);
+        flow.add(self.x, dx);
         Ok(())
     }
 }

@@ -62,7 +62,8 @@ impl Adam {
     /// # Errors
     /// [`Error::Config`] names the first setting that does not work.
     pub fn new(config: &AdamConfig, params: &Params) -> Result<Self> {
-        let fail = |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
+        let fail =
+            |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
         for (what, beta) in [("beta1", config.beta1), ("beta2", config.beta2)] {
             if !(0.0..1.0).contains(&beta) {
                 return fail(what, "a number in [0, 1)", beta);
@@ -73,7 +74,7 @@ impl Adam {
                 return fail(what, "a finite number from 0 on", v);
             }
         }
-        if let Some(max) = config.clip_norm.filter(|c| !(*c > 0.0)) {
+        if let Some(max) = config.clip_norm.filter(|c| c.is_nan() || *c <= 0.0) {
             return fail("clip_norm", "a positive number", max);
         }
         let zeros: Vec<Vec<f32>> = params.variables().map(|v| vec![0.0; v.elem_count()]).collect();

@@ -65,7 +65,10 @@ impl Ema {
         }
         let part = (1.0 - self.config.decay(self.updates)) as f32;
         for (var, a) in params.variables().zip(&mut self.average) {
-            with(var.as_tensor(), |p| if part < 1.0 { optim::blend(a, p, part) } else { a.copy_from_slice(p) })?;
+            with(
+                var.as_tensor(),
+                |p| if part < 1.0 { optim::blend(a, p, part) } else { a.copy_from_slice(p) },
+            )?;
         }
         self.updates += 1;
         Ok(())
@@ -90,7 +93,8 @@ impl Ema {
     /// # Errors
     /// As [`Ema::weights`].
     pub fn state(&self) -> Result<Weights> {
-        let mut out: Weights = self.weights()?.into_iter().map(|(n, t)| (format!("average.{n}"), t)).collect();
+        let mut out: Weights =
+            self.weights()?.into_iter().map(|(n, t)| (format!("average.{n}"), t)).collect();
         let data = vec![(self.updates / UPDATE_BASE) as f32, (self.updates % UPDATE_BASE) as f32];
         out.insert("updates".into(), HostTensor { shape: vec![2], data });
         Ok(out)

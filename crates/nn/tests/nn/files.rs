@@ -2,8 +2,8 @@
 
 use crate::support::{fill, filled, input, rng, values};
 use e2h_nn::{
-    ConditionalUnet1d, Conv1d, Error, HostTensor, Linear, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig,
-    load_weights, save_weights,
+    ConditionalUnet1d, Conv1d, Error, HostTensor, Linear, Mode, Params, RgbEncoder, RgbEncoderConfig,
+    UnetConfig, load_weights, save_weights,
 };
 use std::collections::BTreeMap;
 
@@ -20,13 +20,15 @@ fn unet() -> UnetConfig {
 
 #[test]
 fn export_and_import_are_inverse() {
-    let (params, net) = Params::build(Mode::Train, &mut rng(1), |b| ConditionalUnet1d::new(&unet(), &b.pp("unet"))).unwrap();
+    let (params, net) =
+        Params::build(Mode::Train, &mut rng(1), |b| ConditionalUnet1d::new(&unet(), &b.pp("unet"))).unwrap();
     let weights = params.export().unwrap();
     assert_eq!(weights["unet.up_modules.0.2.weight"].shape, [16, 16, 4]);
     assert_eq!(weights["unet.up_modules.0.0.conv1.block.0.weight"].shape, [16, 64, 5]);
     assert_eq!(weights["unet.down_modules.0.0.cond_encoder.1.weight"].shape, [32, 22]);
     assert_eq!(params.count(), weights.values().map(|t| t.data.len()).sum::<usize>());
-    let (other, copy) = Params::build(Mode::Infer, &mut rng(2), |b| ConditionalUnet1d::new(&unet(), &b.pp("unet"))).unwrap();
+    let (other, copy) =
+        Params::build(Mode::Infer, &mut rng(2), |b| ConditionalUnet1d::new(&unet(), &b.pp("unet"))).unwrap();
     let (x, c) = (input(1, &[2, 4, 2], 1.0, 0.0), input(2, &[2, 6], 1.0, 0.0));
     let run = |n: &ConditionalUnet1d| values(&n.forward(&x, &[3.0, 60.0], &c).unwrap());
     assert_ne!(run(&net), run(&copy));
@@ -43,14 +45,14 @@ fn layout_of_a_convolution() {
     let x = input(1, &[1, 3, 2], 1.0, 0.0);
     let y = values(&net.forward(&x).unwrap());
     let x = values(&x);
-    for o in 0..3 {
+    for (o, got) in y.iter().enumerate() {
         let mut want = w["bias"].data[o];
         for i in 0..2 {
             for k in 0..3 {
                 want += w["weight"].data[(o * 2 + i) * 3 + k] * x[k * 2 + i];
             }
         }
-        assert!((y[o] - want).abs() < 1e-6);
+        assert!((got - want).abs() < 1e-6);
     }
 }
 
@@ -65,7 +67,10 @@ fn import_lists_every_difference_and_changes_nothing() {
     match params.import(&wrong).unwrap_err() {
         Error::Import { missing, unexpected, misshaped } => {
             assert_eq!((missing, unexpected), (vec!["bias".to_owned()], vec!["extra".to_owned()]));
-            assert!(misshaped.len() == 1 && misshaped[0].contains("expected [3, 2], found [2, 3]"), "{misshaped:?}");
+            assert!(
+                misshaped.len() == 1 && misshaped[0].contains("expected [3, 2], found [2, 3]"),
+                "{misshaped:?}"
+            );
         }
         other => panic!("{other}"),
     }
@@ -74,13 +79,15 @@ fn import_lists_every_difference_and_changes_nothing() {
 
 #[test]
 fn a_name_used_twice_is_an_error() {
-    let built = Params::build(Mode::Train, &mut rng(0), |b| Ok((Linear::new(2, 3, b)?, Linear::new(2, 3, b)?)));
+    let built =
+        Params::build(Mode::Train, &mut rng(0), |b| Ok((Linear::new(2, 3, b)?, Linear::new(2, 3, b)?)));
     assert!(matches!(built, Err(Error::Duplicate(_))));
 }
 
 #[test]
 fn files_round_trip() {
-    let (params, _) = Params::build(Mode::Train, &mut rng(1), |b| ConditionalUnet1d::new(&unet(), b)).unwrap();
+    let (params, _) =
+        Params::build(Mode::Train, &mut rng(1), |b| ConditionalUnet1d::new(&unet(), b)).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("w.safetensors");
     let metadata = BTreeMap::from([("step".to_owned(), "12".to_owned())]);

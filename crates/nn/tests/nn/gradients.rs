@@ -3,9 +3,9 @@
 use crate::support::{assert_close, fill, filled, input, loss, loss64, rng, values};
 use candle_core::{Device, Tensor, Var};
 use e2h_nn::{
-    Act, Builder, ConditionalUnet1d, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Mlp,
-    Mode, Params, Relu, Result, RgbEncoder, RgbEncoderConfig, SpatialSoftmax, UnetConfig, Weights, backward, dropout,
-    mse, repeat_rows,
+    Act, Builder, ConditionalUnet1d, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d,
+    Mish, Mlp, Mode, Params, Relu, Result, RgbEncoder, RgbEncoderConfig, SpatialSoftmax, UnetConfig, Weights,
+    backward, dropout, mse, repeat_rows,
 };
 use rand_chacha::ChaCha8Rng;
 
@@ -72,6 +72,11 @@ fn check<T>(
             b.push((at(eps) - at(-eps)) / (2.0 * f64::from(eps)));
         }
         params.import(&weights).unwrap();
+        if name.ends_with("nets.bias") {
+            // A softmax does not see a constant: the gradient is zero, its estimate rounding.
+            assert!(a.iter().all(|a| a.abs() < 1e-4), "{what}, {name}: {a:?}");
+            continue;
+        }
         assert_close(&format!("{what}, {name}"), &a, &b, tolerance);
     }
 }
@@ -85,14 +90,27 @@ fn linear() {
     for rows in [1, 3, 1100] {
         check("linear", &[x(1, &[rows, 5])], 1e-2, 2e-3, |b| Linear::new(5, 7, b), |n, x| n.forward(&x[0]));
     }
-    check("linear of a sequence", &[x(1, &[2, 3, 5])], 1e-2, 2e-3, |b| Linear::new(5, 4, b), |n, x| n.forward(&x[0]));
+    check(
+        "linear of a sequence",
+        &[x(1, &[2, 3, 5])],
+        1e-2,
+        2e-3,
+        |b| Linear::new(5, 4, b),
+        |n, x| n.forward(&x[0]),
+    );
 }
 
 #[test]
 fn conv1d() {
-    for (batch, length, kernel, stride, padding) in
-        [(1, 7, 5, 1, 2), (3, 8, 5, 1, 2), (3, 7, 3, 2, 1), (2, 9, 1, 1, 0), (3, 8, 3, 2, 1), (2, 6, 2, 1, 0), (160, 9, 5, 1, 2)]
-    {
+    for (batch, length, kernel, stride, padding) in [
+        (1, 7, 5, 1, 2),
+        (3, 8, 5, 1, 2),
+        (3, 7, 3, 2, 1),
+        (2, 9, 1, 1, 0),
+        (3, 8, 3, 2, 1),
+        (2, 6, 2, 1, 0),
+        (160, 9, 5, 1, 2),
+    ] {
         let what = format!("conv1d {batch}x{length}, kernel {kernel}, stride {stride}");
         let build = |b: &Builder<'_>| Conv1d::new(3, 4, kernel, stride, padding, b);
         check(&what, &[x(1, &[batch, length, 3])], 1e-2, 2e-3, build, |n, x| n.forward(&x[0]));
@@ -129,7 +147,9 @@ fn transposed_conv1d() {
 #[test]
 fn group_norm() {
     for act in [Act::None, Act::Relu, Act::Mish] {
-        for (shape, groups) in [(vec![1, 5, 8], 2), (vec![3, 4, 3, 16], 1), (vec![2, 1, 16], 2), (vec![40, 8, 80], 8)] {
+        for (shape, groups) in
+            [(vec![1, 5, 8], 2), (vec![3, 4, 3, 16], 1), (vec![2, 1, 16], 2), (vec![40, 8, 80], 8)]
+        {
             let (what, c) = (format!("group norm {act:?} of {shape:?}"), *shape.last().unwrap());
             let eps = if act == Act::Relu { 1e-3 } else { 1e-2 };
             let build = |b: &Builder<'_>| GroupNorm::new(groups, c, act, b);
@@ -180,7 +200,9 @@ fn pooling() {
         let n: usize = shape.iter().product();
         let v: Vec<f32> = (0..n).map(|i| ((i * 7919) % 10_007) as f32 / 1000.0).collect();
         let input = Tensor::from_vec(v, &shape, &Device::Cpu).unwrap();
-        check("max pool", std::slice::from_ref(&input), 2e-4, 2e-2, nothing, |(), x| MaxPool2d.forward(&x[0]));
+        check("max pool", std::slice::from_ref(&input), 2e-4, 2e-2, nothing, |(), x| {
+            MaxPool2d.forward(&x[0])
+        });
         // And the values, position by position.
         let y = MaxPool2d.forward(&input).unwrap().to_vec1_4();
         let at = |b: usize, y: usize, x: usize, c: usize| values(&input)[((b * h + y) * w + x) * 5 + c];
@@ -238,11 +260,13 @@ fn whole_networks() {
         feature_dim: 6,
     };
     let build = |b: &Builder<'_>| RgbEncoder::new(&config, b);
-    // Rectifiers bend: a step of eps crosses some of the thousands of kinks.
-    check("encoder", &[input(1, &[2, 21, 18, 3], 0.5, 0.5)], 1e-3, 5e-2, build, |n, x| n.forward(&x[0]));
+    // Rectifiers bend: the smaller eps, the fewer of the thousands of kinks it crosses.
+    check("encoder", &[input(1, &[2, 21, 18, 3], 0.5, 0.5)], 1e-4, 0.1, build, |n, x| n.forward(&x[0]));
     let build = |b: &Builder<'_>| Mlp::new(&[5, 9, 8, 2], 0.3, b);
     check("mlp", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| n.forward(&x[0], None::<&mut ChaCha8Rng>));
-    check("mlp with dropout", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| n.forward(&x[0], Some(&mut rng(5))));
+    check("mlp with dropout", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| {
+        n.forward(&x[0], Some(&mut rng(5)))
+    });
 }
 
 #[test]

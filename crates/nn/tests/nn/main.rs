@@ -1,4 +1,5 @@
 //! Tests of the layers, the optimisers and the files.
+#![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod files;
 mod golden;

@@ -27,7 +27,8 @@ fn near(config: &AdamConfig, name: &str) {
 
 #[test]
 fn adam_as_in_torch() {
-    let plain = AdamConfig { lr: 2e-2, beta1: 0.9, weight_decay: 0.0, clip_norm: None, ..AdamConfig::default() };
+    let plain =
+        AdamConfig { lr: 2e-2, beta1: 0.9, weight_decay: 0.0, clip_norm: None, ..AdamConfig::default() };
     near(&plain, "adam");
     near(&AdamConfig { weight_decay: 1e-2, ..plain }, "adam_wd");
     near(&AdamConfig { weight_decay: 1e-2, decoupled: true, ..plain }, "adamw");

@@ -3,8 +3,8 @@
 use crate::support::{input, rng, values};
 use candle_core::Tensor;
 use e2h_nn::{
-    Adam, AdamConfig, ConditionalUnet1d, Ema, EmaConfig, Mlp, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig,
-    Weights, backward, mse, repeat_rows,
+    Adam, AdamConfig, ConditionalUnet1d, Ema, EmaConfig, Mlp, Mode, Params, RgbEncoder, RgbEncoderConfig,
+    UnetConfig, Weights, backward, mse, repeat_rows,
 };
 
 fn networks(b: &e2h_nn::Builder<'_>) -> e2h_nn::Result<(RgbEncoder, ConditionalUnet1d)> {

@@ -48,7 +48,7 @@ fn max_sample(x: &[f32], y: &mut [f32], m: &Map) {
             let Some(s) = under(m, oy, ox, tap) else { continue };
             for (y, x) in y.iter_mut().zip(&x[s..s + c]) {
                 // A NaN, once met, stays.
-                *y = if *y >= *x { *y } else { *x };
+                *y = if *x > *y || x.is_nan() { *x } else { *y };
             }
         }
     }

@@ -17,9 +17,6 @@ const TRANSIT: f64 = PEG_TOP + 0.03;
 const RELEASE_GAP: f64 = 0.001;
 /// Fraction of the drawn speed at which the hand goes down to things.
 const GENTLE: f64 = 0.8;
-/// Where over the peg the nut passes its top: spread from the middle, m.
-const ENTRY: f64 = 0.003;
-
 /// Gripper pointing down, its fingers closing along y turned by `yaw`.
 pub(super) fn down(yaw: f64) -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
@@ -63,13 +60,13 @@ pub(super) fn script(
     // Where the nut goes is decided once, at the start.
     let target = match direction {
         Direction::Hard => {
-            let spread = if config.waypoint_noise_m > 0.0 { ENTRY } else { 0.0 };
+            let spread = if config.waypoint_noise_m > 0.0 { v.entry } else { 0.0 };
             [v.peg[0] + gauss(rng, spread), v.peg[1] + gauss(rng, spread)]
         }
         Direction::Easy => [draw(rng, v.start_x), draw(rng, v.start_y)],
     };
     let gripper_yaw = draw(rng, [-FRAC_PI_2, FRAC_PI_2]);
-    let entry = [gauss(rng, ENTRY), gauss(rng, ENTRY)];
+    let entry = [gauss(rng, v.entry), gauss(rng, v.entry)];
     Script::new(config, rng, move |index, sim, _| {
         let nut = sim.object();
         let nut_yaw = yaw_of(&nut.orientation);

@@ -58,6 +58,8 @@ pub(super) struct Variant {
     pub(super) home: [f64; 3],
     /// Largest distance of a nut that is on its peg.
     pub(super) seat_xy: f64,
+    /// How far from the middle the demonstrators pass the peg's top, standard deviation; small against the free play.
+    pub(super) entry: f64,
 }
 
 /// The round nut of the released TR-DRL scene: twice robosuite's, over a 30 mm peg.
@@ -76,6 +78,7 @@ const LOOSE: Variant = Variant {
     peg_yaw: 0.1,
     home: [0.48, -0.12, 0.24],
     seat_xy: 0.05,
+    entry: 0.003,
 };
 
 /// robosuite's round nut.
@@ -110,6 +113,7 @@ const SQUARE: Variant = Variant {
     yaw: Yaw::Quarters,
     home: [0.50, 0.14, 0.24],
     seat_xy: 0.03,
+    entry: 0.0015,
     ..LOOSE
 };
 

@@ -17,9 +17,12 @@ struct Arguments {
     /// Task pair, with a variant after a colon if not the default one (nut_assembly:square).
     #[arg(long, default_value = "nut_assembly", conflicts_with = "all")]
     task: String,
-    /// Every task and variant.
+    /// Every task pair.
     #[arg(long)]
     all: bool,
+    /// With --all: every variant of each pair, not only the default one.
+    #[arg(long, requires = "all")]
+    variants: bool,
     /// Trials of each of the three figures.
     #[arg(long, default_value_t = 100)]
     trials: u32,
@@ -43,10 +46,12 @@ struct Count {
 
 fn main() -> Result<()> {
     let arguments = Arguments::parse();
-    let names: Vec<String> = if arguments.all {
-        registry().iter().flat_map(|t| variants(t).iter().map(move |v| format!("{t}:{v}"))).collect()
-    } else {
-        vec![arguments.task.clone()]
+    let names: Vec<String> = match (arguments.all, arguments.variants) {
+        (false, _) => vec![arguments.task.clone()],
+        (true, false) => registry().iter().map(|&t| t.to_owned()).collect(),
+        (true, true) => {
+            registry().iter().flat_map(|t| variants(t).iter().map(move |v| format!("{t}:{v}"))).collect()
+        }
     };
     if !arguments.json {
         println!(

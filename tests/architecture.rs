@@ -47,7 +47,8 @@ fn only_the_crates_that_may_name_candle_or_mujoco_do() {
 fn core_and_refine_stand_on_nothing_heavy() {
     for (name, path) in crates() {
         let found = dependencies(&path);
-        let own: Vec<&String> = found.iter().filter(|d| d.starts_with("e2h-") || *d == "mujoco-native").collect();
+        let own: Vec<&String> =
+            found.iter().filter(|d| d.starts_with("e2h-") || *d == "mujoco-native").collect();
         match name.as_str() {
             "core" | "nn" => assert!(own.is_empty(), "{name} depends on {own:?}"),
             "refine" | "data" => assert_eq!(own, ["e2h-core"], "{name}"),
@@ -86,7 +87,8 @@ fn libraries_do_not_unwrap() {
             let code = text.split("#[cfg(test)]").next().unwrap_or_default();
             for (i, line) in code.lines().enumerate() {
                 let line = line.trim_start();
-                let found = !line.starts_with("//") && (line.contains(".unwrap()") || line.contains(".expect("));
+                let found =
+                    !line.starts_with("//") && (line.contains(".unwrap()") || line.contains(".expect("));
                 assert!(!found, "{name}: {}:{}", file.display(), i + 1);
             }
         }

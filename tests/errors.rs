@@ -29,7 +29,10 @@ fn a_run_directory_is_never_overwritten() {
     let out = dir.path().join("run");
     assert_success(&nut_assembly(&out, &["--set=loop.iterations=0"]).output().unwrap());
     fails(&mut nut_assembly(&out, &["--set=loop.iterations=0"]), &["exists", "--resume"]);
-    fails(&mut nut_assembly(&out, &["--resume", "--set=loop.iterations=1"]), &["config.toml", "expected", "found"]);
+    fails(
+        &mut nut_assembly(&out, &["--resume", "--set=loop.iterations=1"]),
+        &["config.toml", "expected", "found"],
+    );
     fails(
         &mut nut_assembly(&out, &["--resume", "--set=loop.iterations=0", "--seed", "9"]),
         &["run", "seed 9", "seed 0"],
@@ -64,8 +67,11 @@ fn a_run_directory_is_never_overwritten() {
 fn a_loss_that_is_no_number_stops_the_run_with_step_and_seed() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("run");
-    let arguments =
-        ["--set=train.step.schedule.lr=1e30", "--set=train.step.schedule.warmup=0", "--set=train.step.adam.clip_norm=0.0"];
+    let arguments = [
+        "--set=train.step.schedule.lr=1e30",
+        "--set=train.step.schedule.warmup=0",
+        "--set=train.step.adam.clip_norm=0.0",
+    ];
     fails(&mut nut_assembly(&out, &arguments), &["step", "seed 0", "loss"]);
     assert!(out.join("demonstrations").exists(), "what was made before is lost");
 }

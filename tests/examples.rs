@@ -14,7 +14,10 @@ fn nut_assembly_runs_from_nothing_and_its_checkpoint_evaluates() {
     assert!(printed.contains("report.html") && printed.contains("Wilson"), "{printed}");
     let html = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(html.contains("<svg") && html.contains("nut_assembly"));
-    assert!(!html.contains("http://") || html.contains("http://www.w3.org"), "the page refers to the network");
+    assert!(
+        !html.contains("http://") || html.contains("http://www.w3.org"),
+        "the page refers to the network"
+    );
     assert!(out.join("results.json").exists());
 
     let video = dir.path().join("rollouts.png");

@@ -314,8 +314,7 @@ mod tests {
     }
 
     fn episode(rows: usize) -> Episode {
-        let mut e =
-            Episode::new(Origin::demonstration("t", Direction::Easy, 0, 1), &["table".to_owned()]);
+        let mut e = Episode::new(Origin::demonstration("t", Direction::Easy, 0, 1), &["table".to_owned()]);
         for t in 0..rows {
             e.push(&observation(t as f32, 2), &[t as f32; ACTION_DIM]).unwrap();
         }

@@ -30,9 +30,12 @@ mod tests {
     fn streams_repeat_and_differ() {
         let a = stream(1, "noise", 0, 0).next_u64();
         assert_eq!(a, stream(1, "noise", 0, 0).next_u64());
-        for other in
-            [stream(2, "noise", 0, 0), stream(1, "crop", 0, 0), stream(1, "noise", 1, 0), stream(1, "noise", 0, 1)]
-        {
+        for other in [
+            stream(2, "noise", 0, 0),
+            stream(1, "crop", 0, 0),
+            stream(1, "noise", 1, 0),
+            stream(1, "noise", 0, 1),
+        ] {
             assert_ne!(a, other.clone().next_u64());
         }
     }

@@ -146,16 +146,10 @@ pub fn collect(
         let left: usize = lanes.iter().map(|l| l.state.cycles.len()).sum();
         (config.cycles - left, text)
     };
-    drive(
-        &mut lanes,
-        hard,
-        easy,
-        &|lane, finished, direction| next(lane, finished, direction),
-        |lanes| {
-            let (done, text) = summary(lanes);
-            bar.set(done as u64, &text);
-        },
-    )?;
+    drive(&mut lanes, hard, easy, &|lane, finished, direction| next(lane, finished, direction), |lanes| {
+        let (done, text) = summary(lanes);
+        bar.set(done as u64, &text);
+    })?;
     bar.finish(&summary(&lanes).1);
 
     let mut all = Collected::default();

@@ -214,9 +214,9 @@ impl RunConfig {
 
     fn from_table(preset: &str, table: Table) -> Result<Resolved> {
         let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
-        let config: Self = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
-            Error::Config(e.to_string().trim().replace('\n', " "))
-        })?;
+        let config: Self = Value::Table(table)
+            .try_into()
+            .map_err(|e: toml::de::Error| Error::Config(e.to_string().trim().replace('\n', " ")))?;
         config.validate()?;
         Ok(Resolved { preset: preset.to_owned(), config, text })
     }
@@ -345,7 +345,11 @@ mod tests {
 
     #[test]
     fn overrides_win_and_keep_types() {
-        let set = ["loop.cycles=7".to_owned(), "train.step.adam.lr = 1".to_owned(), "task.variant=square".to_owned()];
+        let set = [
+            "loop.cycles=7".to_owned(),
+            "train.step.adam.lr = 1".to_owned(),
+            "task.variant=square".to_owned(),
+        ];
         let r = RunConfig::resolve("smoke", "nut_assembly", &set).unwrap().config;
         assert_eq!(r.closed_loop.cycles, 7);
         assert!((r.train.step.adam.lr - 1.0).abs() < 1e-9);
@@ -356,7 +360,9 @@ mod tests {
     fn unknown_names_are_answered_with_the_nearest() {
         let text = |r: Result<Resolved>| r.unwrap_err().to_string();
         assert!(text(RunConfig::resolve("lapto", "nut_assembly", &[])).contains("did you mean `laptop`"));
-        assert!(text(RunConfig::resolve("smoke", "nut_asembly", &[])).contains("did you mean `nut_assembly`"));
+        assert!(
+            text(RunConfig::resolve("smoke", "nut_asembly", &[])).contains("did you mean `nut_assembly`")
+        );
         let set = |s: &str| text(RunConfig::resolve("smoke", "nut_assembly", &[s.to_owned()]));
         assert!(set("loop.cycle=3").contains("did you mean `loop.cycles`"));
         assert!(set("loop.cycles=many").contains("expected a value of type integer"));

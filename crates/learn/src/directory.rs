@@ -44,7 +44,13 @@ fn sync(dir: &Path) -> Result<()> {
 
 impl Directory {
     /// Makes a new run directory, or goes on with one of the same run.
-    pub(crate) fn open(path: &Path, resume: bool, task: &str, seed: u64, resolved: &Resolved) -> Result<Self> {
+    pub(crate) fn open(
+        path: &Path,
+        resume: bool,
+        task: &str,
+        seed: u64,
+        resolved: &Resolved,
+    ) -> Result<Self> {
         let this = Self { path: path.to_owned() };
         let identity =
             Identity { format: FORMAT, task: task.to_owned(), preset: resolved.preset.clone(), seed };
@@ -52,10 +58,9 @@ impl Directory {
         if !file.exists() {
             // A folder without run.json is a run that was killed at its first instant, or somebody else's.
             let foreign = path.exists()
-                && std::fs::read_dir(path)
-                    .map_err(io("reading", path))?
-                    .flatten()
-                    .any(|e| e.file_name() != "config.toml" && !e.file_name().to_string_lossy().starts_with(".tmp"));
+                && std::fs::read_dir(path).map_err(io("reading", path))?.flatten().any(|e| {
+                    e.file_name() != "config.toml" && !e.file_name().to_string_lossy().starts_with(".tmp")
+                });
             if foreign {
                 return Err(Error::Exists(path.to_owned()));
             }
@@ -124,7 +129,12 @@ impl Directory {
     }
 
     /// Writes a folder of episodes and a JSON file in it; the folder appears whole or not at all.
-    pub(crate) fn put_episodes<T: Serialize>(&self, name: &str, episodes: &[Episode], notes: &T) -> Result<()> {
+    pub(crate) fn put_episodes<T: Serialize>(
+        &self,
+        name: &str,
+        episodes: &[Episode],
+        notes: &T,
+    ) -> Result<()> {
         let beside_name = format!("{name}.unfinished");
         let (beside, place) = (self.join(&beside_name), self.join(name));
         if beside.exists() {

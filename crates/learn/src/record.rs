@@ -68,8 +68,7 @@ impl Collection {
     /// Share of cycles that needed no external reset, in [0, 1] (the paper's automatic-reset rate).
     #[must_use]
     pub fn automatic_reset_rate(&self) -> f64 {
-        let resets: usize =
-            self.resets.iter().filter(|(cause, _)| *cause != "start").map(|(_, n)| n).sum();
+        let resets: usize = self.resets.iter().filter(|(cause, _)| *cause != "start").map(|(_, n)| n).sum();
         if self.cycles == 0 { 0.0 } else { 1.0 - (resets.min(self.cycles) as f64 / self.cycles as f64) }
     }
 }

@@ -193,10 +193,8 @@ impl Run {
             .iter()
             .flat_map(|e| filtered(reverse(e, &r.reverse), c.closed_loop.refine_demonstrations))
             .collect();
-        let easy_training: Vec<Episode> = easy
-            .iter()
-            .flat_map(|e| filtered(e.clone(), c.closed_loop.refine_easy_demonstrations))
-            .collect();
+        let easy_training: Vec<Episode> =
+            easy.iter().flat_map(|e| filtered(e.clone(), c.closed_loop.refine_easy_demonstrations)).collect();
         let config = NormaliserConfig { margin: c.train.normaliser_margin, ..NormaliserConfig::default() };
         let normaliser = Normaliser::fit(&hard, &config)?;
         Ok(Base {
@@ -241,10 +239,22 @@ impl Run {
         let steps = if accepted.is_empty() { 0 } else { self.config().train.update_steps };
         let data = (&base.hard_training[..], accepted);
         let name = format!("train hard {iteration}");
-        self.train(&folder(iteration, "policy"), &name, Direction::Hard, iteration, steps, base, data, Some(policy))
+        self.train(
+            &folder(iteration, "policy"),
+            &name,
+            Direction::Hard,
+            iteration,
+            steps,
+            base,
+            data,
+            Some(policy),
+        )
     }
 
-    #[allow(clippy::too_many_arguments, reason = "one private place where all that differs between stages meets")]
+    #[allow(
+        clippy::too_many_arguments,
+        reason = "one private place where all that differs between stages meets"
+    )]
     fn train(
         &self,
         place: &str,
@@ -266,7 +276,8 @@ impl Run {
         let data = TrainingData::new(data.0, data.1, share, &c.policy, &base.normaliser)?;
         let weights = start.map(DiffusionPolicy::weights).transpose()?;
         let purpose = format!("train/{direction}/{iteration}");
-        let mut trainer = Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?;
+        let mut trainer =
+            Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?;
         let saved = self.dir.join(format!("{place}/training.safetensors"));
         if saved.exists() {
             trainer.restore(&saved)?;
@@ -354,7 +365,12 @@ impl Run {
     ///
     /// # Errors
     /// When the simulation fails.
-    pub fn collect(&self, iteration: u32, hard: &DiffusionPolicy, easy: &DiffusionPolicy) -> Result<Collected> {
+    pub fn collect(
+        &self,
+        iteration: u32,
+        hard: &DiffusionPolicy,
+        easy: &DiffusionPolicy,
+    ) -> Result<Collected> {
         let c = &self.config().closed_loop;
         collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)
     }
@@ -376,7 +392,8 @@ impl Run {
         let clock = Instant::now();
         let mut notes = vec![];
         let reversed: Vec<Episode> = collected.easy.iter().map(|e| reverse(e, &r.reverse)).collect();
-        let candidates: Vec<Episode> = reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
+        let candidates: Vec<Episode> =
+            reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
         let kinematic: Vec<Refined> = candidates
             .iter()
             .map(|e| {
@@ -461,10 +478,7 @@ impl Run {
         ]);
         let stored = AcceptedNotes { collection, stage_minutes };
         self.dir.put_episodes(&folder(iteration, "segments"), &segments, &stored)?;
-        Ok(Accepted {
-            segments: segments.into_iter().map(Arc::new).collect(),
-            collection: stored.collection,
-        })
+        Ok(Accepted { segments: segments.into_iter().map(Arc::new).collect(), collection: stored.collection })
     }
 
     /// Measures the hard policy and appends its row to the record.
@@ -487,7 +501,8 @@ impl Run {
         let (evaluation, trials) = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, &self.progress)?;
         if e.filmed > 0 {
             let filmed: Vec<usize> = (0..e.filmed.min(trials.len())).collect();
-            let films = film(&mut self.env.clone_shared()?, policy, Direction::Hard, &filmed, e.seed, "table", 160)?;
+            let films =
+                film(&mut self.env.clone_shared()?, policy, Direction::Hard, &filmed, e.seed, "table", 160)?;
             let path = self.dir.join(folder(iteration, "rollouts.png"));
             report::animation::write_apng(&path, &picture::tiles(&films, 3), 10)?;
         }
@@ -549,7 +564,9 @@ impl Run {
         self.dir.put("results.json", &results)?;
         let mut pictures = report::Pictures::default();
         let mut views = self.env.clone_shared()?;
-        for (direction, title) in [(Direction::Hard, "hard task, start"), (Direction::Easy, "easy task, start")] {
+        for (direction, title) in
+            [(Direction::Hard, "hard task, start"), (Direction::Easy, "easy task, start")]
+        {
             views.reset(direction, &mut stream(self.options.seed, "views", 0, 0))?;
             for camera in ["table", "wrist"] {
                 let image = views.render(camera, 320, 320)?;

@@ -6,6 +6,10 @@ use e2h_core::{Episode, Observation, Rng, State};
 use e2h_data::Normaliser;
 use rand::Rng as _;
 
+/// Normalised entries are clamped to this: an object that rolled off the table would otherwise drive a network to where no
+/// data ever were.
+const STATE_LIMIT: f32 = 4.0;
+
 /// Top-left corner of a crop, pixels (row, column).
 pub(crate) type Corner = (usize, usize);
 
@@ -39,13 +43,19 @@ impl Host {
     }
 
     /// Appends the normalised state history of one sample; `noise` is (standard deviation, stream) in training.
-    pub(crate) fn push_state(&mut self, rows: Rows<'_>, normaliser: &Normaliser, mut noise: Option<(f32, &mut Rng)>) {
+    pub(crate) fn push_state(
+        &mut self,
+        rows: Rows<'_>,
+        normaliser: &Normaliser,
+        mut noise: Option<(f32, &mut Rng)>,
+    ) {
         let mut push = |state: &State| {
             let start = self.state.len();
-            self.state.extend(normaliser.normalise_state(state));
+            let limit = |v: f32| v.clamp(-STATE_LIMIT, STATE_LIMIT);
+            self.state.extend(normaliser.normalise_state(state).map(limit));
             if self.relative {
                 // In units of 10 cm: centred on zero and of the order of one, whatever the task's ranges are.
-                self.state.extend((0..3).map(|i| (state[7 + i] - state[i]) * 10.0));
+                self.state.extend((0..3).map(|i| limit((state[7 + i] - state[i]) * 10.0)));
             }
             if let Some((sigma, rng)) = &mut noise
                 && *sigma > 0.0

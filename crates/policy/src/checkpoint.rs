@@ -91,7 +91,11 @@ impl Checkpoint {
             .and_then(|()| beside.write_all(b"\n"))
             .and_then(|()| beside.as_file().sync_all())
             .map_err(io("writing", &path))?;
-        beside.persist(&path).map_err(|e| Error::Io { doing: "renaming to", path: path.clone(), source: e.error })?;
+        beside.persist(&path).map_err(|e| Error::Io {
+            doing: "renaming to",
+            path: path.clone(),
+            source: e.error,
+        })?;
         std::fs::File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
     }
 
@@ -101,8 +105,11 @@ impl Checkpoint {
     /// When a file is missing, of another format or version, or the weights are not those that were saved with it.
     pub fn read(dir: &Path) -> Result<(Self, Weights)> {
         let path = dir.join(CONFIG_FILE);
-        let text = std::fs::read_to_string(&path)
-            .map_err(|source| Error::Io { doing: "reading checkpoint", path: path.clone(), source })?;
+        let text = std::fs::read_to_string(&path).map_err(|source| Error::Io {
+            doing: "reading checkpoint",
+            path: path.clone(),
+            source,
+        })?;
         let fail = |problem: String| Error::Checkpoint { path: path.clone(), problem };
         // The version is looked at alone first: a newer file may have fields that this reader does not know.
         let value: serde_json::Value =
@@ -121,8 +128,11 @@ impl Checkpoint {
         }
         file.config.validate()?;
         let weights_path = dir.join(WEIGHTS_FILE);
-        let bytes = std::fs::read(&weights_path)
-            .map_err(|source| Error::Io { doing: "reading checkpoint", path: weights_path.clone(), source })?;
+        let bytes = std::fs::read(&weights_path).map_err(|source| Error::Io {
+            doing: "reading checkpoint",
+            path: weights_path.clone(),
+            source,
+        })?;
         let found = hex(&bytes);
         if found != file.weights_sha256 {
             return Err(Error::Checkpoint {

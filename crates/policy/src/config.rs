@@ -101,7 +101,8 @@ impl PolicyConfig {
     /// Width of the U-Net's global condition.
     #[must_use]
     pub fn condition_dim(&self) -> usize {
-        self.n_obs_steps * self.state_features() + self.n_image_steps * self.cameras.len() * self.image_features
+        self.n_obs_steps * self.state_features()
+            + self.n_image_steps * self.cameras.len() * self.image_features
     }
 
     /// Checks that the parts fit together.
@@ -119,7 +120,10 @@ impl PolicyConfig {
         check(positive(self.n_obs_steps), "n_obs_steps: expected at least 1, got 0".to_owned());
         check(
             self.n_image_steps <= self.n_obs_steps,
-            format!("n_image_steps: expected at most n_obs_steps ({}), got {}", self.n_obs_steps, self.n_image_steps),
+            format!(
+                "n_image_steps: expected at most n_obs_steps ({}), got {}",
+                self.n_obs_steps, self.n_image_steps
+            ),
         );
         let multiple = 1 << self.down_dims.len().saturating_sub(1);
         check(!self.down_dims.is_empty(), "down_dims: expected at least one level, got none".to_owned());
@@ -146,7 +150,10 @@ impl PolicyConfig {
                 format!("down_dims: expected multiples of n_groups ({}), got {d}", self.n_groups),
             );
         }
-        check(self.kernel_size % 2 == 1, format!("kernel_size: expected an odd number, got {}", self.kernel_size));
+        check(
+            self.kernel_size % 2 == 1,
+            format!("kernel_size: expected an odd number, got {}", self.kernel_size),
+        );
         check(
             self.step_embed_dim >= 4 && self.step_embed_dim.is_multiple_of(2),
             format!("step_embed_dim: expected an even number from 4, got {}", self.step_embed_dim),

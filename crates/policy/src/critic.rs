@@ -33,7 +33,13 @@ pub struct CriticReport {
 }
 
 impl Critic {
-    fn new(policy: &PolicyConfig, critic: &CriticConfig, normaliser: &Normaliser, mode: Mode, seed: u64) -> Result<Self> {
+    fn new(
+        policy: &PolicyConfig,
+        critic: &CriticConfig,
+        normaliser: &Normaliser,
+        mode: Mode,
+        seed: u64,
+    ) -> Result<Self> {
         let config = PolicyConfig { crop_size: critic.crop_size.min(policy.crop_size), ..policy.clone() };
         let dims: Vec<usize> =
             std::iter::once(config.condition_dim()).chain(critic.hidden.iter().copied()).chain([1]).collect();
@@ -42,7 +48,8 @@ impl Critic {
             condition = Some(ConditionEncoder::new(&config, &b.pp("diffusion")));
             Mlp::new(&dims, critic.dropout, &b.pp("head"))
         })?;
-        let condition = condition.unwrap_or_else(|| Err(Error::Config("the critic has no encoder".to_owned())))?;
+        let condition =
+            condition.unwrap_or_else(|| Err(Error::Config("the critic has no encoder".to_owned())))?;
         Ok(Self { params, condition, head, normaliser: normaliser.clone(), config })
     }
 
@@ -63,9 +70,16 @@ impl Critic {
         Ok(self.head.forward(&condition, dropout)?)
     }
 
-    fn push(&self, host: &mut Host, episode: &Episode, t: usize, augment: Option<(&mut Rng, f32)>) -> Result<()> {
+    fn push(
+        &self,
+        host: &mut Host,
+        episode: &Episode,
+        t: usize,
+        augment: Option<(&mut Rng, f32)>,
+    ) -> Result<()> {
         let c = &self.config;
-        let rows: Vec<usize> = (0..c.n_obs_steps).map(|k| (t + k + 1).saturating_sub(c.n_obs_steps)).collect();
+        let rows: Vec<usize> =
+            (0..c.n_obs_steps).map(|k| (t + k + 1).saturating_sub(c.n_obs_steps)).collect();
         host.push_state(Rows::Episode(episode, &rows), &self.normaliser, None);
         if c.n_image_steps == 0 {
             return Ok(());
@@ -80,14 +94,15 @@ impl Critic {
                 }
                 None => (c.centre_crop(), None),
             };
-            let frames = episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
-                Error::Data(format!(
-                    "expected images of {0} x {0} from camera {1}, found {2:?}",
-                    c.image_size,
-                    c.cameras[camera],
-                    episode.frames.iter().map(|f| (&f.camera, f.height)).collect::<Vec<_>>()
-                ))
-            })?;
+            let frames =
+                episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
+                    Error::Data(format!(
+                        "expected images of {0} x {0} from camera {1}, found {2:?}",
+                        c.image_size,
+                        c.cameras[camera],
+                        episode.frames.iter().map(|f| (&f.camera, f.height)).collect::<Vec<_>>()
+                    ))
+                })?;
             for &row in &rows[c.n_obs_steps - c.n_image_steps..] {
                 host.push_image(camera, frames.image(row), corner, c.crop_size, jitter);
             }

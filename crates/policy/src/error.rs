@@ -21,7 +21,9 @@ pub enum Error {
     #[error("training data: {0}")]
     Data(String),
     /// The loss is not a finite number.
-    #[error("training diverged: the loss is {loss} at step {step} (seed {seed}); the last good checkpoint is kept")]
+    #[error(
+        "training diverged: the loss is {loss} at step {step} (seed {seed}); the last good checkpoint is kept"
+    )]
     NotFinite {
         /// Step at which it appeared.
         step: usize,

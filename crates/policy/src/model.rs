@@ -26,8 +26,10 @@ impl ConditionEncoder {
             (_, true) => vec!["rgb_encoder".to_owned()],
             (n, false) => (0..n).map(|i| format!("rgb_encoder.{i}")).collect(),
         };
-        let encoders =
-            names.iter().map(|name| RgbEncoder::new(&encoder, &builder.pp(name))).collect::<e2h_nn::Result<_>>()?;
+        let encoders = names
+            .iter()
+            .map(|name| RgbEncoder::new(&encoder, &builder.pp(name)))
+            .collect::<e2h_nn::Result<_>>()?;
         Ok(Self { encoders, config: config.clone() })
     }
 
@@ -94,8 +96,8 @@ impl DiffusionModel {
             condition = Some(ConditionEncoder::new(config, &b));
             ConditionalUnet1d::new(&unet, &b.pp("unet"))
         })?;
-        let condition =
-            condition.unwrap_or_else(|| Err(crate::Error::Config("the network has no encoder".to_owned())))?;
+        let condition = condition
+            .unwrap_or_else(|| Err(crate::Error::Config("the network has no encoder".to_owned())))?;
         Ok(Self { params, condition, unet })
     }
 

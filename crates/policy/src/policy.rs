@@ -99,7 +99,11 @@ impl DiffusionPolicy {
             }
             for observation in history {
                 if observation.frames.len() < c.cameras.len() {
-                    return wrong("cameras", format!("{:?}", c.cameras), observation.frames.len().to_string());
+                    return wrong(
+                        "cameras",
+                        format!("{:?}", c.cameras),
+                        observation.frames.len().to_string(),
+                    );
                 }
                 for (image, camera) in observation.frames.iter().zip(&c.cameras) {
                     let n = c.image_size;
@@ -142,7 +146,13 @@ impl DiffusionPolicy {
             let first_image = c.n_obs_steps - c.n_image_steps;
             for camera in 0..c.cameras.len() {
                 for observation in &history[first_image..] {
-                    host.push_image(camera, &observation.frames[camera].data, c.centre_crop(), c.crop_size, None);
+                    host.push_image(
+                        camera,
+                        &observation.frames[camera].data,
+                        c.centre_crop(),
+                        c.crop_size,
+                        None,
+                    );
                 }
             }
         }

@@ -159,14 +159,19 @@ impl Trainer {
             if c.n_image_steps > 0 {
                 for camera in 0..c.cameras.len() {
                     let corner = c.random_crop(rng);
-                    let frames = episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
-                        Error::Data(format!(
-                            "expected images of {0} x {0} from {1:?}, found {2:?}",
-                            c.image_size,
-                            c.cameras,
-                            episode.frames.iter().map(|f| (&f.camera, f.height, f.width)).collect::<Vec<_>>()
-                        ))
-                    })?;
+                    let frames =
+                        episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
+                            Error::Data(format!(
+                                "expected images of {0} x {0} from {1:?}, found {2:?}",
+                                c.image_size,
+                                c.cameras,
+                                episode
+                                    .frames
+                                    .iter()
+                                    .map(|f| (&f.camera, f.height, f.width))
+                                    .collect::<Vec<_>>()
+                            ))
+                        })?;
                     for &row in &window.observations[first_image..] {
                         host.push_image(camera, frames.image(row), corner, c.crop_size, None);
                     }
@@ -176,7 +181,7 @@ impl Trainer {
                 clean.extend(data.normaliser.normalise_action(&episode.action[row]));
             }
             for _ in 0..t.noises {
-                mask.extend(window.mask.iter().map(|&m| if m { 1.0 } else { 0.0 }));
+                mask.extend(window.mask.iter().map(|&m| if m { 1.0f32 } else { 0.0 }));
             }
         }
         let mut noisy = Vec::with_capacity(rows * per);

@@ -3,6 +3,7 @@
 //! ```text
 //! cargo bench --bench laptop
 //! ```
+#![allow(clippy::expect_used, reason = "a bench that cannot be set up should stop")]
 #![allow(missing_docs, reason = "criterion's macros make undocumented items")]
 
 use auto_e2h::core::{Direction, Episode, Observation, Origin, stream};

@@ -4,6 +4,8 @@
 //! cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7
 //! ```
 
+#![allow(clippy::print_stdout, reason = "what an example is for")]
+
 use anyhow::Context;
 use auto_e2h::learn::{Progress, Published, evaluate, film, report};
 use clap::Parser;

@@ -6,6 +6,8 @@
 //!
 //! The paper's algorithm 1, line by line; see the README for what it prints and how long it takes.
 
+#![allow(clippy::print_stdout, reason = "what an example is for")]
+
 mod common;
 
 use auto_e2h::learn::{Run, report};

@@ -75,22 +75,3 @@ fn methods_name_no_task_and_tasks_no_method() {
         }
     }
 }
-
-#[test]
-fn libraries_do_not_unwrap() {
-    for (name, path) in crates() {
-        let mut files = vec![];
-        sources(&path.join("src"), &mut files);
-        for file in files {
-            let text = std::fs::read_to_string(&file).unwrap();
-            // Tests inside a file come last by convention.
-            let code = text.split("#[cfg(test)]").next().unwrap_or_default();
-            for (i, line) in code.lines().enumerate() {
-                let line = line.trim_start();
-                let found =
-                    !line.starts_with("//") && (line.contains(".unwrap()") || line.contains(".expect("));
-                assert!(!found, "{name}: {}:{}", file.display(), i + 1);
-            }
-        }
-    }
-}

@@ -1,5 +1,7 @@
 //! Tests of the whole, in one binary: each module says what it is about.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot be set up should fail")]
+
 mod architecture; // the invariants of ARCHITECTURE.md that a program can check
 mod errors; // wrong input and trouble with files: a clear message, before any work, nothing lost
 mod examples; // every example binary with the smoke preset

@@ -54,7 +54,7 @@ struct Arguments {
 }
 
 /// What the command line asks for.
-pub fn options(task: &str) -> anyhow::Result<RunOptions> {
+pub(crate) fn options(task: &str) -> anyhow::Result<RunOptions> {
     let a = Arguments::parse();
     if a.device == Device::Cuda {
         bail!("--device cuda: this version computes on the CPU only");

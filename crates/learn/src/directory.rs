@@ -152,7 +152,7 @@ impl Directory {
     /// Reads what [`Directory::put_episodes`] wrote; none when it is not there.
     pub(crate) fn get_episodes<T: DeserializeOwned>(&self, name: &str) -> Result<Option<(Vec<Episode>, T)>> {
         let Some(notes) = self.get(&format!("{name}/notes.json"))? else { return Ok(None) };
-        let store = EpisodeStore::open(&self.join(name))?;
+        let store = EpisodeStore::open(self.join(name))?;
         let episodes = store.names()?.iter().map(|n| store.read(n)).collect::<std::result::Result<_, _>>()?;
         Ok(Some((episodes, notes)))
     }

@@ -76,13 +76,16 @@ pub(crate) struct Lane<S> {
     pub(crate) state: S,
 }
 
+/// What a lane does when its rollout of a task ended.
+pub(crate) type Next<'a, S> = dyn Fn(&mut Lane<S>, Finished, Direction) -> Result<()> + Sync + 'a;
+
 /// Runs all lanes until none has a rollout. `next` is called with a lane whose rollout just ended (what it left, and which
 /// task it did) and starts its next one, if there is to be one; it runs on the lane's own thread. `tick` hears how many lanes still run.
 pub(crate) fn drive<S: Send>(
     lanes: &mut [Lane<S>],
     hard: &dyn Policy,
     easy: &dyn Policy,
-    next: &(dyn Fn(&mut Lane<S>, Finished, Direction) -> Result<()> + Sync),
+    next: &Next<'_, S>,
     mut tick: impl FnMut(&[Lane<S>]),
 ) -> Result<()> {
     loop {

@@ -5,6 +5,7 @@
 mod architecture; // the invariants of ARCHITECTURE.md that a program can check
 mod errors; // wrong input and trouble with files: a clear message, before any work, nothing lost
 mod examples; // every example binary with the smoke preset
+mod pipeline; // refinement, critic and update on scripted rollouts
 mod resume; // kills at random instants, and thread counts: the same bytes
 
 use std::path::{Path, PathBuf};

@@ -1,0 +1,144 @@
+//! The tiny network really learns, saves, and says what does not fit.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot be set up should fail")]
+
+use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
+use e2h_data::{Normaliser, NormaliserConfig};
+use e2h_policy::{
+    CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind, TrainConfig,
+    Trainer, TrainingData, train_critic,
+};
+use std::sync::Arc;
+
+/// A path along a line; the images brighten with it.
+fn episode(rows: usize, success: bool) -> Episode {
+    let cameras = ["table".to_owned(), "wrist".to_owned()];
+    let mut episode = Episode::new(Origin::demonstration("line", Direction::Hard, 0, 0), &cameras);
+    for t in 0..rows {
+        let x = t as f32 * 0.01;
+        let state = [x, -x, 0.5 * x, 0., 1., 0., 0., 0.3, x, 0.1, 1., 0., 0., 0., if t < 20 { 0.08 } else { 0.03 }];
+        let image = Image { height: 24, width: 24, data: vec![(t * 4) as u8; 24 * 24 * 3] };
+        let action = [x + 0.01, -x - 0.01, 0.5 * x, 0., 1., 0., 0., if t < 20 { 1. } else { 0. }];
+        episode.push(&Observation { state, frames: vec![image.clone(), image] }, &action).unwrap();
+    }
+    if success {
+        episode.outcome = e2h_core::Outcome::Success { at: rows - 1 };
+    }
+    episode
+}
+
+fn train_config() -> TrainConfig {
+    TrainConfig {
+        conditions: 16,
+        noises: 2,
+        conditioning_dropout: 0.0,
+        observation_noise: 0.0,
+        adam: e2h_nn::AdamConfig { clip_norm: Some(1.0), ..Default::default() },
+        schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 2e-3, warmup: 10 },
+        ema: e2h_nn::EmaConfig::default(),
+    }
+}
+
+#[test]
+fn one_trajectory_is_overfitted_and_the_sampled_actions_are_its_own() {
+    let episodes = [Arc::new(episode(40, true))];
+    let config = PolicyConfig::tiny();
+    let normaliser = Normaliser::fit(&episodes.each_ref().map(|e| &**e), &NormaliserConfig::default()).unwrap();
+    let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
+    let mut trainer = Trainer::new(&config, &train_config(), 400, None, 1, "overfit").unwrap();
+    let losses: Vec<f32> = (0..400).map(|_| trainer.step(&data).unwrap()).collect();
+    let last = losses[380..].iter().sum::<f32>() / 20.0;
+    assert!(last < 0.02 && last < losses[0] / 20.0, "loss {} to {last}", losses[0]);
+
+    let policy = DiffusionPolicy::with_weights(&config, &normaliser, &trainer.weights().unwrap()).unwrap();
+    let e = &episodes[0];
+    let seen: Vec<Observation> = [9, 10]
+        .map(|t| Observation {
+            state: e.state[t],
+            frames: e.frames.iter().map(|f| Image { height: 24, width: 24, data: f.image(t).to_vec() }).collect(),
+        })
+        .to_vec();
+    let chunk = policy.sample(&[seen.iter().collect()], &mut [stream(0, "act", 0, 0)]).unwrap().remove(0);
+    for (k, action) in chunk.iter().enumerate() {
+        let want = &e.action[10 + k];
+        for i in 0..3 {
+            assert!((action[i] - want[i]).abs() < 0.04, "action {k}: {action:?}, expected {want:?}");
+        }
+        assert_eq!(action[7] > 0.5, want[7] > 0.5, "gripper of action {k}: {}", action[7]);
+    }
+}
+
+#[test]
+fn a_checkpoint_comes_back_and_refuses_another_network() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = PolicyConfig::tiny();
+    let normaliser = Normaliser::fit(&[episode(30, true)], &NormaliserConfig::default()).unwrap();
+    let policy = DiffusionPolicy::untrained(&config, &normaliser, 3).unwrap();
+    policy.save(dir.path(), &Provenance::default()).unwrap();
+    let (back, checkpoint) = DiffusionPolicy::load(dir.path()).unwrap();
+    assert_eq!(back.weights().unwrap(), policy.weights().unwrap());
+    assert_eq!(checkpoint.config, config);
+    let other = PolicyConfig { down_dims: vec![16, 32], ..config };
+    let error = DiffusionPolicy::with_weights(&other, &normaliser, &policy.weights().unwrap()).err().unwrap();
+    assert!(error.to_string().contains("diffusion.unet."), "{error}");
+    let short = Observation { state: [0.0; 15], frames: vec![] };
+    let error = policy.sample(&[vec![&short, &short]], &mut [stream(0, "act", 0, 0)]).err().unwrap();
+    assert!(matches!(error, Error::Observation { .. }), "{error}");
+}
+
+#[test]
+fn training_goes_on_from_a_saved_state_with_the_same_bytes() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("training.safetensors");
+    let episodes = [Arc::new(episode(40, true))];
+    let config = PolicyConfig::tiny();
+    let normaliser = Normaliser::fit(&[episode(40, true)], &NormaliserConfig::default()).unwrap();
+    let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
+    let new = || Trainer::new(&config, &train_config(), 8, None, 1, "resume").unwrap();
+    let (mut whole, mut first, mut second) = (new(), new(), new());
+    for _ in 0..8 {
+        whole.step(&data).unwrap();
+    }
+    for _ in 0..3 {
+        first.step(&data).unwrap();
+    }
+    first.save(&path).unwrap();
+    second.restore(&path).unwrap();
+    assert_eq!(second.step_count(), 3);
+    for _ in 0..5 {
+        second.step(&data).unwrap();
+    }
+    assert_eq!(whole.weights().unwrap(), second.weights().unwrap());
+}
+
+#[test]
+fn a_critic_learns_that_successes_end_higher_than_failures() {
+    // Failures have the object elsewhere: the value can be told from what is seen.
+    let mut rollouts: Vec<Episode> = (0..6).map(|i| episode(40, i < 3)).collect();
+    for state in rollouts[3..].iter_mut().flat_map(|e| &mut e.state) {
+        state[7] = 0.6;
+    }
+    let config = PolicyConfig::tiny();
+    let normaliser = Normaliser::fit(&rollouts, &NormaliserConfig::default()).unwrap();
+    let policy = DiffusionPolicy::untrained(&config, &normaliser, 3).unwrap();
+    let critic = CriticConfig {
+        crop_size: 18,
+        hidden: vec![32, 16],
+        dropout: 0.0,
+        colour_jitter: 0.1,
+        batch: 32,
+        steps: 150,
+        validation: 0.2,
+        adam: e2h_nn::AdamConfig { lr: 2e-3, ..Default::default() },
+    };
+    let weights = policy.weights().unwrap();
+    let (critic, report) =
+        train_critic(&config, &critic, &normaliser, &weights, &rollouts, 100, 0, "critic", |_, _| {}).unwrap();
+    assert!(report.train_loss < 0.05, "{}", report.train_loss);
+    let values = critic.evaluate(&rollouts[0]).unwrap();
+    assert_eq!(values.len(), 40);
+    // G rises along a success: 1 - 40/200 at the start, 1 - 1/200 at the end.
+    assert!((values[39] - 0.995).abs() < 0.25, "{values:?}");
+    let failed = critic.evaluate(&rollouts[5]).unwrap();
+    assert!((failed[39] - -0.005).abs() < 0.25, "{failed:?}");
+}

@@ -1,0 +1,89 @@
+use auto_e2h::core::{Direction, Kind, Origin, stream};
+use auto_e2h::env::{Env, demonstrate, task};
+use auto_e2h::learn::{Collected, Run, RunOptions};
+use std::path::Path;
+use std::time::Duration;
+
+fn options(out: &Path) -> RunOptions {
+    RunOptions {
+        task: "nut_assembly".to_owned(),
+        preset: "smoke".to_owned(),
+        seed: 5,
+        set: vec!["env.horizon_hard=500".to_owned(), "env.horizon_easy=500".to_owned()],
+        out: Some(out.to_owned()),
+        resume: false,
+        threads: None,
+        quiet: true,
+    }
+}
+
+/// Scripted episodes in place of rollouts: what a trained pair of policies would bring, without the training.
+fn scripted(run: &Run) -> Collected {
+    let config = run.config();
+    let pair = task(&config.task.name, &config.task.options()).unwrap();
+    let mut env = Env::new(pair, &config.env).unwrap();
+    let mut record = |direction: Direction, episode: u32| {
+        let mut origin = Origin::demonstration("nut_assembly", direction, episode, 5);
+        (origin.kind, origin.iteration) = (Kind::Rollout, 1);
+        let mut rng = stream(77, direction.name(), 0, u64::from(episode));
+        let episode = demonstrate(&mut env, direction, &config.task.demonstrator, origin, &mut rng).unwrap();
+        assert!(episode.outcome.is_success());
+        episode
+    };
+    let easy: Vec<_> = (0..3).map(|i| record(Direction::Easy, i)).collect();
+    let mut hard: Vec<_> = (0..4).map(|i| record(Direction::Hard, i)).collect();
+    // One failure: the first half of a success.
+    let half: Vec<usize> = (0..hard[3].len() / 2).collect();
+    hard[3] = hard[3].select(&half);
+    hard[3].outcome = auto_e2h::core::Outcome::Timeout;
+    Collected { easy_rollouts: 4, easy_successes: 3, hard, easy, ..Collected::default() }
+}
+
+#[test]
+fn accepted_rollouts_are_refined_stored_and_learned_from() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = Run::open(&options(&dir.path().join("run"))).unwrap();
+    let base = run.demonstrations().unwrap();
+    let hard = run.train_initial(&base).unwrap();
+    let collected = scripted(&run);
+    let frames: usize = collected.easy.iter().map(auto_e2h::core::Episode::len).sum();
+    let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
+
+    let c = &accepted.collection;
+    assert_eq!((c.accepted, c.hard_successes), (3, 3));
+    assert_eq!(c.fates.values().sum::<usize>(), frames, "every frame has one fate: {:?}", c.fates);
+    assert_eq!(c.frames_kept, accepted.segments.iter().map(|s| s.len()).sum::<usize>());
+    assert!(c.fates["kept"] < frames && c.fates.contains_key("low_advantage"), "{:?}", c.fates);
+    assert!(c.critic_loss.is_some_and(f64::is_finite) && c.notes.is_empty());
+    for segment in &accepted.segments {
+        segment.validate().unwrap();
+        assert!(segment.origin.reversed && segment.origin.kind == Kind::Refined);
+    }
+    let stored = run.stored(1).unwrap().unwrap();
+    assert_eq!(stored.segments, accepted.segments);
+    assert_eq!(stored.collection, accepted.collection);
+
+    let updated = run.update(1, &hard, &base, &run.training_set(1, &accepted).unwrap()).unwrap();
+    assert_ne!(updated.weights().unwrap(), hard.weights().unwrap());
+}
+
+#[test]
+fn without_a_hard_success_the_critic_is_skipped_and_without_rollouts_the_update() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = Run::open(&options(&dir.path().join("run"))).unwrap();
+    let base = run.demonstrations().unwrap();
+    let hard = run.train_initial(&base).unwrap();
+    let mut collected = scripted(&run);
+    collected.hard.retain(|e| !e.outcome.is_success());
+    let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
+    assert!(accepted.collection.notes.iter().any(|n| n.contains("no hard rollout succeeded")));
+    assert!(!accepted.collection.fates.contains_key("low_advantage"));
+    assert!(!accepted.segments.is_empty());
+
+    let none = run.refine(2, Collected::default(), Duration::ZERO, &base, &hard).unwrap();
+    assert!(none.segments.is_empty());
+    let same = run.update(2, &hard, &base, &none.segments).unwrap();
+    assert_eq!(same.weights().unwrap(), hard.weights().unwrap());
+    let record = run.evaluate(2, &same, Some(&none)).unwrap();
+    assert!(record.skipped);
+}

@@ -6,8 +6,7 @@
 
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
-use anyhow::Context;
-use auto_e2h::learn::{Progress, Published, evaluate, film, report};
+use auto_e2h::learn::{Filming, Progress, Published, evaluate, report};
 use clap::Parser;
 use std::path::PathBuf;
 
@@ -46,16 +45,19 @@ fn main() -> anyhow::Result<()> {
     let parallel = published.config.evaluation.parallel.min(a.trials);
     let progress = Progress::new(a.json);
     let (policy, direction) = (&published.policy, published.direction);
-    let (result, trials) =
-        evaluate(published.envs(parallel)?, policy, direction, a.trials, a.seed, &progress)?;
+    let run = |filming: Option<&Filming>| -> anyhow::Result<_> {
+        Ok(evaluate(published.envs(parallel)?, policy, direction, a.trials, a.seed, filming, &progress)?)
+    };
+    let done = run(None)?;
+    let result = &done.evaluation;
 
     if let Some(path) = &a.video {
-        let mut order: Vec<usize> = (0..trials.len()).collect();
-        order.sort_by_key(|&i| trials[i].outcome.is_success());
-        order.truncate(a.filmed);
-        let mut env = published.envs(1)?.pop().context("no simulation")?;
-        let films = film(&mut env, policy, direction, &order, a.seed, "table", 200)?;
-        let (outcomes, frames): (Vec<_>, Vec<_>) = films.into_iter().unzip();
+        let mut trials: Vec<usize> = (0..done.trials.len()).collect();
+        trials.sort_by_key(|&i| done.trials[i].outcome.is_success());
+        trials.truncate(a.filmed);
+        // The same evaluation again: which trials fail is known only after the first.
+        let filming = Filming { trials, camera: "table".to_owned(), size: 200 };
+        let (outcomes, frames): (Vec<_>, Vec<_>) = run(Some(&filming))?.films.into_iter().unzip();
         report::animation::write_apng(path, &report::animation::tile(&frames, &outcomes, 3), 10)?;
     }
 

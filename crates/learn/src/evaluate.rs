@@ -1,7 +1,7 @@
 //! Success of a policy over trials at fixed seeds.
 
 use crate::record::{Evaluation, wilson95};
-use crate::rollout::{Lane, Rollout, drive};
+use crate::rollout::{Film, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Image, Outcome, Policy, stream};
 use e2h_env::Env;
@@ -16,15 +16,38 @@ pub struct Trial {
     pub steps: usize,
 }
 
+/// Which trials of an evaluation are filmed, and how.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Filming {
+    /// Indices of the trials.
+    pub trials: Vec<usize>,
+    /// Camera of the scene.
+    pub camera: String,
+    /// Side of the pictures, pixels.
+    pub size: usize,
+}
+
+/// What an evaluation left.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Evaluated {
+    /// Successes of trials.
+    pub evaluation: Evaluation,
+    /// Every trial, in order.
+    pub trials: Vec<Trial>,
+    /// One film a filmed trial, in the order asked for.
+    pub films: Vec<(Outcome, Vec<Image>)>,
+}
+
 struct Queue {
     /// Trials still to do, in reverse.
     trials: Vec<usize>,
     current: usize,
-    done: Vec<(usize, Trial)>,
+    done: Vec<(usize, Trial, Option<Film>)>,
 }
 
 /// Runs `trials` trials of `direction` from external resets drawn from `seed`, several simulations side by side.
-/// `envs` are fresh simulations of the same task, one a lane.
+/// `envs` are fresh simulations of the same task, one a lane. Filming changes nothing else: a trial's last bits depend on how many
+/// others the policy answers with it, so a film has to be made in the evaluation itself to show what was counted.
 ///
 /// # Errors
 /// When the observations do not fit the policy or the simulation fails.
@@ -34,8 +57,9 @@ pub fn evaluate(
     direction: Direction,
     trials: usize,
     seed: u64,
+    filming: Option<&Filming>,
     progress: &Progress,
-) -> Result<(Evaluation, Vec<Trial>)> {
+) -> Result<Evaluated> {
     let start = Instant::now();
     let n = envs.len();
     if n == 0 || trials == 0 {
@@ -46,7 +70,12 @@ pub fn evaluate(
         lane.state.current = trial;
         lane.env.reset(direction, &mut stream(seed, "evaluate/reset", 0, trial as u64))?;
         let rng = stream(seed, "evaluate/act", 0, trial as u64);
-        lane.rollout = Some(Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, None)?);
+        let mut rollout = Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, None)?;
+        if let Some(f) = filming.filter(|f| f.trials.contains(&trial)) {
+            let film = Film { camera: f.camera.clone(), size: f.size, frames: vec![] };
+            rollout = rollout.filmed(&mut lane.env, film)?;
+        }
+        lane.rollout = Some(rollout);
         Ok(())
     };
     let mut lanes: Vec<Lane<Queue>> = envs
@@ -67,18 +96,25 @@ pub fn evaluate(
         policy,
         &|lane, finished, _| {
             let trial = Trial { outcome: finished.outcome, steps: finished.steps };
-            lane.state.done.push((lane.state.current, trial));
+            lane.state.done.push((lane.state.current, trial, finished.film));
             begin(lane)
         },
         |lanes| {
             let done = || lanes.iter().flat_map(|l| &l.state.done);
-            let k = done().filter(|(_, t)| t.outcome.is_success()).count();
+            let k = done().filter(|(_, t, _)| t.outcome.is_success()).count();
             bar.set(done().count() as u64, &format!("{k} succeeded"));
         },
     )?;
-    let mut done: Vec<(usize, Trial)> = lanes.into_iter().flat_map(|l| l.state.done).collect();
-    done.sort_by_key(|(i, _)| *i);
-    let results: Vec<Trial> = done.into_iter().map(|(_, t)| t).collect();
+    let mut done: Vec<(usize, Trial, Option<Film>)> = lanes.into_iter().flat_map(|l| l.state.done).collect();
+    done.sort_by_key(|(i, _, _)| *i);
+    let results: Vec<Trial> = done.iter().map(|(_, t, _)| *t).collect();
+    let films = filming.map_or(vec![], |f| {
+        let film = |&i: &usize| {
+            let (_, trial, film) = done.get_mut(i)?;
+            Some((trial.outcome, film.take()?.frames))
+        };
+        f.trials.iter().filter_map(film).collect()
+    });
     let successes: Vec<usize> = results.iter().filter(|t| t.outcome.is_success()).map(|t| t.steps).collect();
     let k = successes.len();
     bar.finish(&format!("{k} of {trials} succeeded"));
@@ -89,46 +125,5 @@ pub fn evaluate(
         mean_steps: if k == 0 { 0.0 } else { successes.iter().sum::<usize>() as f64 / k as f64 },
         seconds: start.elapsed().as_secs_f64(),
     };
-    Ok((evaluation, results))
-}
-
-/// Films the given trials of an evaluation again, from `camera` at `size` pixels, every second control step.
-///
-/// # Errors
-/// As [`evaluate`].
-pub fn film(
-    env: &mut Env,
-    policy: &dyn Policy,
-    direction: Direction,
-    trials: &[usize],
-    seed: u64,
-    camera: &str,
-    size: usize,
-) -> Result<Vec<(Outcome, Vec<Image>)>> {
-    let mut films = Vec::with_capacity(trials.len());
-    for &trial in trials {
-        env.reset(direction, &mut stream(seed, "evaluate/reset", 0, trial as u64))?;
-        let mut rng = [stream(seed, "evaluate/act", 0, trial as u64)];
-        env.begin(direction)?;
-        let mut history = vec![env.observe()?; policy.n_obs_steps()];
-        let mut frames = vec![env.render(camera, size, size)?];
-        let mut steps = 0;
-        let outcome = 'episode: loop {
-            let chunk = policy.act(&[history.iter().collect()], &mut rng)?.swap_remove(0);
-            for action in &chunk {
-                let end = env.step(action)?;
-                steps += 1;
-                if steps % 2 == 0 || end.is_some() {
-                    frames.push(env.render(camera, size, size)?);
-                }
-                if let Some(outcome) = end {
-                    break 'episode outcome;
-                }
-                history.remove(0);
-                history.push(env.observe()?);
-            }
-        };
-        films.push((outcome, frames));
-    }
-    Ok(films)
+    Ok(Evaluated { evaluation, trials: results, films })
 }

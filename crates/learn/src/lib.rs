@@ -39,7 +39,7 @@ mod run;
 pub use collect::{Collected, collect};
 pub use config::{Resolved, RunConfig};
 pub use error::{Error, Result};
-pub use evaluate::{Trial, evaluate, film};
+pub use evaluate::{Evaluated, Filming, Trial, evaluate};
 pub use progress::{Bar, Progress};
 pub use published::Published;
 pub use run::{Accepted, Base, Run, RunOptions, set_threads};

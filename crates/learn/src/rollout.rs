@@ -5,10 +5,24 @@
 //! threads nor their timing can change a result.
 
 use crate::Result;
-use e2h_core::{Action, Direction, Episode, Observation, Origin, Outcome, Policy, Rng};
+use e2h_core::{Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng};
 use e2h_env::Env;
 use rayon::prelude::*;
 use std::collections::VecDeque;
+
+/// Pictures of a rollout for people, every second control step.
+pub(crate) struct Film {
+    pub(crate) camera: String,
+    pub(crate) size: usize,
+    pub(crate) frames: Vec<Image>,
+}
+
+impl Film {
+    fn shoot(&mut self, env: &mut Env) -> Result<()> {
+        self.frames.push(env.render(&self.camera, self.size, self.size)?);
+        Ok(())
+    }
+}
 
 /// One episode in progress in one simulation.
 pub(crate) struct Rollout {
@@ -17,6 +31,7 @@ pub(crate) struct Rollout {
     history: VecDeque<Observation>,
     /// None: frames are rendered only where the policy looks (evaluation).
     episode: Option<Episode>,
+    film: Option<Film>,
     steps: usize,
 }
 
@@ -25,6 +40,7 @@ pub(crate) struct Finished {
     pub(crate) outcome: Outcome,
     pub(crate) steps: usize,
     pub(crate) episode: Option<Episode>,
+    pub(crate) film: Option<Film>,
 }
 
 impl Rollout {
@@ -40,7 +56,14 @@ impl Rollout {
         let first = env.observe()?;
         let history = std::iter::repeat_n(first, n_obs_steps).collect();
         let episode = record.map(|origin| Episode::new(origin, env.cameras()));
-        Ok(Self { direction, rng, history, episode, steps: 0 })
+        Ok(Self { direction, rng, history, episode, film: None, steps: 0 })
+    }
+
+    /// Films the rollout from its present state on.
+    pub(crate) fn filmed(mut self, env: &mut Env, mut film: Film) -> Result<Self> {
+        film.shoot(env)?;
+        self.film = Some(film);
+        Ok(self)
     }
 
     /// Executes `chunk`; Some when the episode ended in it.
@@ -51,12 +74,15 @@ impl Rollout {
             }
             let end = env.step(action)?;
             self.steps += 1;
+            if let Some(film) = self.film.as_mut().filter(|_| self.steps.is_multiple_of(2) || end.is_some()) {
+                film.shoot(env)?;
+            }
             if let Some(outcome) = end {
                 let episode = self.episode.take().map(|mut episode| {
                     episode.outcome = outcome;
                     episode
                 });
-                return Ok(Some(Finished { outcome, steps: self.steps, episode }));
+                return Ok(Some(Finished { outcome, steps: self.steps, episode, film: self.film.take() }));
             }
             // Without a recording only the observations that the next policy call gets are worth rendering.
             if self.episode.is_some() || i + self.history.len() >= chunk.len() {

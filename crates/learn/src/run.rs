@@ -6,7 +6,7 @@
 use crate::collect::{Collected, collect};
 use crate::config::{Resolved, RunConfig};
 use crate::directory::{Directory, write_atomic};
-use crate::evaluate::{evaluate, film};
+use crate::evaluate::{Filming, evaluate};
 use crate::picture;
 use crate::record::{Collection, IterationRecord, RunResults};
 use crate::report;
@@ -498,13 +498,13 @@ impl Run {
         let c = self.config();
         let e = &c.evaluation;
         let envs = self.envs(e.parallel.min(e.trials))?;
-        let (evaluation, trials) = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, &self.progress)?;
-        if e.filmed > 0 {
-            let filmed: Vec<usize> = (0..e.filmed.min(trials.len())).collect();
-            let films =
-                film(&mut self.env.clone_shared()?, policy, Direction::Hard, &filmed, e.seed, "table", 160)?;
+        let filming = Filming { trials: (0..e.filmed).collect(), camera: "table".to_owned(), size: 160 };
+        let filming = (e.filmed > 0).then_some(&filming);
+        let done = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, filming, &self.progress)?;
+        let evaluation = done.evaluation;
+        if !done.films.is_empty() {
             let path = self.dir.join(folder(iteration, "rollouts.png"));
-            report::animation::write_apng(&path, &picture::tiles(&films, 3), 10)?;
+            report::animation::write_apng(&path, &picture::tiles(&done.films, 3), 10)?;
         }
         let place = folder(iteration, "policy");
         let trained: Option<TrainNotes> = self.dir.get(&format!("{place}/notes.json"))?;

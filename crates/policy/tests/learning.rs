@@ -5,8 +5,8 @@
 use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_policy::{
-    CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind, TrainConfig,
-    Trainer, TrainingData, train_critic,
+    CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind,
+    TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::sync::Arc;
 
@@ -16,7 +16,8 @@ fn episode(rows: usize, success: bool) -> Episode {
     let mut episode = Episode::new(Origin::demonstration("line", Direction::Hard, 0, 0), &cameras);
     for t in 0..rows {
         let x = t as f32 * 0.01;
-        let state = [x, -x, 0.5 * x, 0., 1., 0., 0., 0.3, x, 0.1, 1., 0., 0., 0., if t < 20 { 0.08 } else { 0.03 }];
+        let state =
+            [x, -x, 0.5 * x, 0., 1., 0., 0., 0.3, x, 0.1, 1., 0., 0., 0., if t < 20 { 0.08 } else { 0.03 }];
         let image = Image { height: 24, width: 24, data: vec![(t * 4) as u8; 24 * 24 * 3] };
         let action = [x + 0.01, -x - 0.01, 0.5 * x, 0., 1., 0., 0., if t < 20 { 1. } else { 0. }];
         episode.push(&Observation { state, frames: vec![image.clone(), image] }, &action).unwrap();
@@ -43,7 +44,8 @@ fn train_config() -> TrainConfig {
 fn one_trajectory_is_overfitted_and_the_sampled_actions_are_its_own() {
     let episodes = [Arc::new(episode(40, true))];
     let config = PolicyConfig::tiny();
-    let normaliser = Normaliser::fit(&episodes.each_ref().map(|e| &**e), &NormaliserConfig::default()).unwrap();
+    let normaliser =
+        Normaliser::fit(&episodes.each_ref().map(|e| &**e), &NormaliserConfig::default()).unwrap();
     let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
     let mut trainer = Trainer::new(&config, &train_config(), 400, None, 1, "overfit").unwrap();
     let losses: Vec<f32> = (0..400).map(|_| trainer.step(&data).unwrap()).collect();
@@ -55,7 +57,11 @@ fn one_trajectory_is_overfitted_and_the_sampled_actions_are_its_own() {
     let seen: Vec<Observation> = [9, 10]
         .map(|t| Observation {
             state: e.state[t],
-            frames: e.frames.iter().map(|f| Image { height: 24, width: 24, data: f.image(t).to_vec() }).collect(),
+            frames: e
+                .frames
+                .iter()
+                .map(|f| Image { height: 24, width: 24, data: f.image(t).to_vec() })
+                .collect(),
         })
         .to_vec();
     let chunk = policy.sample(&[seen.iter().collect()], &mut [stream(0, "act", 0, 0)]).unwrap().remove(0);
@@ -133,7 +139,8 @@ fn a_critic_learns_that_successes_end_higher_than_failures() {
     };
     let weights = policy.weights().unwrap();
     let (critic, report) =
-        train_critic(&config, &critic, &normaliser, &weights, &rollouts, 100, 0, "critic", |_, _| {}).unwrap();
+        train_critic(&config, &critic, &normaliser, &weights, &rollouts, 100, 0, "critic", |_, _| {})
+            .unwrap();
     assert!(report.train_loss < 0.05, "{}", report.train_loss);
     let values = critic.evaluate(&rollouts[0]).unwrap();
     assert_eq!(values.len(), 40);

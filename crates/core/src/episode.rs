@@ -253,7 +253,7 @@ impl Episode {
                     camera: f.camera.clone(),
                     height: f.height,
                     width: f.width,
-                    data: rows.iter().flat_map(|&r| f.image(r).iter().copied()).collect(),
+                    data: rows.iter().map(|&r| f.image(r)).collect::<Vec<_>>().concat(),
                 })
                 .collect(),
             source: rows.iter().map(|&r| self.source[r]).collect(),

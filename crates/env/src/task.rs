@@ -81,24 +81,8 @@ pub fn task(name: &str, options: &TaskOptions) -> Result<Arc<dyn Task>> {
 }
 
 fn unknown(what: &'static str, name: &str, known: &[&str]) -> Error {
-    let nearest = known.iter().min_by_key(|k| distance(name, k)).copied().unwrap_or_default();
+    let nearest = e2h_core::nearest(name, known.iter().copied()).unwrap_or_default();
     Error::Unknown { what, name: name.to_owned(), nearest: nearest.to_owned(), known: known.join(", ") }
-}
-
-/// Letters to insert, delete or replace between two names.
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(x != *y);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! A run's configuration: preset < task file < `--set key=value`, checked before any work.
 
 use crate::{Error, Result};
+use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
 use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
 use e2h_refine::{AdvantageConfig, GateConfig, KinematicConfig, ReverseConfig, SuffixConfig};
@@ -291,26 +292,6 @@ fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
         }
     }
     Ok(())
-}
-
-/// The candidate with the fewest edits from `name`.
-fn nearest<'a>(name: &str, candidates: impl Iterator<Item = &'a str>) -> Option<&'a str> {
-    candidates.min_by_key(|c| edits(name, c))
-}
-
-fn edits(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(x != *y);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(row[j] + 1).min(diagonal + 1);
-        }
-    }
-    row[b.len()]
 }
 
 #[cfg(test)]

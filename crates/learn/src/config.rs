@@ -274,7 +274,7 @@ fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
         let full = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
         let Some(slot) = base.get_mut(key) else {
             let candidates: Vec<&str> = base.keys().map(String::as_str).collect();
-            let nearest = nearest(key, candidates.into_iter()).unwrap_or_default();
+            let nearest = nearest(key, candidates).unwrap_or_default();
             let prefix = if path.is_empty() { String::new() } else { format!("{path}.") };
             return Err(Error::Config(format!("unknown key `{full}`; did you mean `{prefix}{nearest}`?")));
         };

@@ -1,0 +1,130 @@
+//! What a run says of itself: one row of the record an iteration, and the report at the end.
+
+use super::{Accepted, AcceptedNotes, Base, Run, TrainNotes, folder};
+use crate::Result;
+use crate::evaluate::{Filming, evaluate};
+use crate::picture;
+use crate::record::{IterationRecord, RunResults};
+use crate::report;
+use e2h_core::{Direction, Episode, stream};
+use e2h_policy::DiffusionPolicy;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+impl Run {
+    /// Measures the hard policy and appends its row to the record.
+    ///
+    /// # Errors
+    /// When the simulation fails or the folder cannot be written.
+    pub fn evaluate(
+        &self,
+        iteration: u32,
+        policy: &DiffusionPolicy,
+        accepted: Option<&Accepted>,
+    ) -> Result<IterationRecord> {
+        let file = folder(iteration, "record.json");
+        if let Some(record) = self.dir.get(&file)? {
+            return Ok(record);
+        }
+        let c = self.config();
+        let e = &c.evaluation;
+        let envs = self.envs(e.parallel.min(e.trials))?;
+        let filming = Filming { trials: (0..e.filmed).collect(), camera: "table".to_owned(), size: 160 };
+        let filming = (e.filmed > 0).then_some(&filming);
+        let done = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, filming, &self.progress)?;
+        let evaluation = done.evaluation;
+        if !done.films.is_empty() {
+            let path = self.dir.join(folder(iteration, "rollouts.png"));
+            report::animation::write_apng(&path, &picture::tiles(&done.films, 3), 10)?;
+        }
+        let place = folder(iteration, "policy");
+        let trained: Option<TrainNotes> = self.dir.get(&format!("{place}/notes.json"))?;
+        let mut stage_minutes = BTreeMap::from([("evaluate".to_owned(), evaluation.seconds / 60.0)]);
+        stage_minutes.insert("train".to_owned(), trained.as_ref().map_or(0.0, |t| t.minutes));
+        if iteration == 0 {
+            let easy: Option<TrainNotes> = self.dir.get("policy_easy/notes.json")?;
+            stage_minutes.insert("train easy".to_owned(), easy.map_or(0.0, |t| t.minutes));
+            let recorded: Option<BTreeMap<String, f64>> = self.dir.get("demonstrations/notes.json")?;
+            let recorded = recorded.and_then(|r| r.get("minutes").copied()).unwrap_or(0.0);
+            stage_minutes.insert("demonstrations".to_owned(), recorded);
+        } else if let Some(notes) =
+            self.dir.get::<AcceptedNotes>(&folder(iteration, "segments/notes.json"))?
+        {
+            stage_minutes.extend(notes.stage_minutes);
+        }
+        let before = if iteration == 0 {
+            0.0
+        } else {
+            let previous: Option<IterationRecord> = self.dir.get(&folder(iteration - 1, "record.json"))?;
+            previous.map_or(0.0, |p| p.minutes)
+        };
+        let record = IterationRecord {
+            iteration,
+            evaluation,
+            minutes: before + stage_minutes.values().sum::<f64>(),
+            stage_minutes,
+            collection: accepted.map(|a| a.collection.clone()),
+            loss: trained.map_or(0.0, |t| t.loss),
+            skipped: accepted.is_some_and(|a| a.segments.is_empty()),
+        };
+        self.dir.put(&file, &record)?;
+        self.progress.say(&format!(
+            "iteration {iteration}: {} of {} trials, {:.1} minutes",
+            record.evaluation.successes, record.evaluation.trials, record.minutes
+        ));
+        Ok(record)
+    }
+
+    /// Writes `results.json` and `report.html`; returns the results and the report's path.
+    ///
+    /// # Errors
+    /// When the folder cannot be written.
+    pub fn report(&self, base: &Base, records: Vec<IterationRecord>) -> Result<(RunResults, PathBuf)> {
+        let c = self.config();
+        let steps: usize = base.easy.iter().map(Episode::len).sum();
+        let results = RunResults {
+            task: self.options.task.clone(),
+            variant: c.task.variant.clone(),
+            preset: self.options.preset.clone(),
+            seed: self.options.seed,
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            machine: machine(),
+            iterations: records,
+            demonstration_steps: steps as f64 / base.easy.len().max(1) as f64,
+        };
+        self.dir.put("results.json", &results)?;
+        let mut pictures = report::Pictures::default();
+        let mut views = self.env.clone_shared()?;
+        for (direction, title) in
+            [(Direction::Hard, "hard task, start"), (Direction::Easy, "easy task, start")]
+        {
+            views.reset(direction, &mut stream(self.options.seed, "views", 0, 0))?;
+            for camera in ["table", "wrist"] {
+                let image = views.render(camera, 320, 320)?;
+                pictures.views.push((format!("{camera} camera: {title}"), report::png_bytes(&image)?));
+            }
+        }
+        for n in 0..=self.iterations() {
+            if let Ok(bytes) = std::fs::read(self.dir.join(folder(n, "rollouts.png"))) {
+                pictures.animations.push((format!("iteration {n}: rollouts at evaluation seeds"), bytes));
+            }
+            if let Ok(svg) = std::fs::read_to_string(self.dir.join(folder(n, "filter.svg"))) {
+                pictures.filter.push((format!("iteration {n}: one reversed rollout"), svg));
+            }
+        }
+        let path = report::write_report(self.dir.path(), &results, &self.resolved.text, &pictures)?;
+        Ok((results, path))
+    }
+}
+
+/// Threads and the processor's name where the system tells it.
+fn machine() -> String {
+    let name = std::fs::read_to_string("/proc/cpuinfo")
+        .ok()
+        .and_then(|text| {
+            let line = text.lines().find(|l| l.starts_with("model name"))?;
+            Some(line.split_once(':')?.1.trim().to_owned())
+        })
+        .unwrap_or_else(|| std::env::consts::ARCH.to_owned());
+    format!("{name}, {} threads", rayon::current_num_threads())
+}

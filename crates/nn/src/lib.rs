@@ -2,7 +2,7 @@
 //!
 //! Several of Candle's gradients are wrong without an error, and its graph allocates for every gradient that flows. Here a
 //! network's forward pass is one node of Candle's graph with a backward pass of its own, over channels-last buffers and
-//! direct calls to `gemm`. Parameters keep the names and, in files, the layouts of PyTorch.
+//! products whose tiles live in registers (AVX-512, AVX2 or plain, chosen at run time). Parameters keep the names and, in files, the layouts of PyTorch.
 //!
 //! The same seed gives the same bytes in any number of threads. Deliberately knows nothing of robots, data or diffusion
 //! schedules.
@@ -42,6 +42,8 @@ mod tape;
 mod unet;
 mod weights;
 
+/// The tensors of this crate's interface.
+pub use candle_core;
 pub use error::{Error, Result};
 pub use grad::{Grads, backward, backward_many, no_grad};
 pub use layers::{

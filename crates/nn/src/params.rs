@@ -1,3 +1,4 @@
+use crate::kernel::conv::in_panels;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
 use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Storage, Tensor, Var};
@@ -16,7 +17,8 @@ pub enum Mode {
     Infer,
 }
 
-/// How a weight's axes lie here: `order[j]` is the PyTorch axis that is our axis j. `None` keeps PyTorch's.
+/// How a weight's axes lie here: `order[j]` is the PyTorch axis that is our axis j, and the last is cut into the panels of
+/// [`crate::kernel::conv::panel`]. `None` keeps PyTorch's, uncut.
 pub(crate) type Order = Option<&'static [usize]>;
 
 /// A weight as a layer holds it.
@@ -83,6 +85,8 @@ impl Builder<'_> {
             Init::Zeros => vec![0.0; n],
         };
         let inner: Vec<usize> = order.map_or(shape.to_vec(), |o| o.iter().map(|a| shape[*a]).collect());
+        let data =
+            if order.is_some() { in_panels(&data, inner.last().copied().unwrap_or(1), false) } else { data };
         let var = Var::from_vec(data, inner, &Device::Cpu)?;
         let train = self.shared.mode == Mode::Train;
         let tensor = if train { var.as_tensor().clone() } else { var.as_detached_tensor() };
@@ -235,6 +239,14 @@ fn inward(data: &[f32], shape: &[usize], order: Order) -> Vec<f32> {
 /// Copies between PyTorch's layout `shape` and ours, in the direction asked for.
 fn permute(data: &[f32], shape: &[usize], order: Order, inward: bool) -> Vec<f32> {
     let Some(order) = order else { return data.to_vec() };
+    let columns = order.last().map_or(1, |a| shape[*a]);
+    if !inward {
+        return permute_axes(&in_panels(data, columns, true), shape, order, false);
+    }
+    in_panels(&permute_axes(data, shape, order, true), columns, false)
+}
+
+fn permute_axes(data: &[f32], shape: &[usize], order: &[usize], inward: bool) -> Vec<f32> {
     let mut strides = vec![1; shape.len()];
     for i in (1..shape.len()).rev() {
         strides[i - 1] = strides[i] * shape[i];

@@ -1,19 +1,27 @@
-//! Convolutions as matrix products over patches, a cache-sized tile of patches at a time.
+//! Convolutions as sums of matrix products, one a tap, over rows that are found through pointers: no patches are copied.
+//!
+//! Weights lie in panels of columns ([`panel`]): `(n / width, taps, c, width)`. A product reads a panel from front to back,
+//! where rows a power of two apart would fall into the same few places of the caches.
 
-use super::{Mat, add_assign, matmul, scratch, simd, worthwhile};
+use super::micro::{Isa, MAX_ROWS, Outer, Rows, Start};
+use super::{add_assign, scratch, threads};
 use rayon::prelude::*;
-use std::cell::RefCell;
+use std::ptr::null;
 
-/// Numbers in a tile of patches: 256 KiB, half of a usual second-level cache.
-const TILE: usize = 1 << 16;
-/// Up to this many output positions all patches are laid out at once and the threads share one product.
-const FEW: usize = 1024;
-/// At most so many partial weight gradients.
+/// Tiles of rows in a task: as many as share a panel of the matrix while it is in the second-level cache.
+const TILES: usize = 8;
+/// Below so many tasks over the rows, the columns are shared out too.
+const TASKS: usize = 8;
+/// Multiplications from which another thread is worth waking.
+const WORTHWHILE: usize = 1 << 18;
+/// Positions of a weight gradient that are summed before the next block of it.
+const BLOCK: usize = 256;
+/// From so many numbers on, a weight gradient is shared out by its own numbers; below, by positions.
+const LARGE: usize = 1 << 16;
+/// Into how many sums a small weight gradient is split.
 const PARTS: usize = 8;
-
-thread_local! {
-    static PATCHES: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
-}
+/// Below so many channels the taps of a row are read as one run, from a copy with its border.
+const NARROW: usize = 16;
 
 /// Sizes of a convolution from `(b, h, w, c)` to `(b, out_h, out_w, n)`. One dimension: `h` and `kh` are 1.
 #[derive(Clone, Copy, Debug)]
@@ -47,297 +55,623 @@ impl Geo {
         self.out_h() * self.out_w()
     }
     /// Output positions of all samples.
-    pub(crate) fn m(&self) -> usize {
+    fn m(&self) -> usize {
         self.b * self.per()
     }
-    /// Numbers in a patch.
-    pub(crate) fn k(&self) -> usize {
-        self.kh * self.kw * self.c
+    /// Numbers of a sample of the input.
+    fn size(&self) -> usize {
+        self.h * self.w * self.c
     }
-    /// Whether a patch is a row of the input.
-    fn pointwise(&self) -> bool {
-        self.kh * self.kw * self.sh * self.sw == 1 && self.ph + self.pw == 0
-    }
-    fn tile(&self) -> usize {
-        (TILE / self.k().max(1)).clamp(32, 512)
+    fn taps(&self) -> usize {
+        self.kh * self.kw
     }
 }
 
-fn with_patches<R>(n: usize, f: impl FnOnce(&mut [f32]) -> R) -> R {
-    // Taken out of its cell, so that a task stolen meanwhile could not meet a borrowed one.
-    let mut buffer = PATCHES.with(RefCell::take);
-    if buffer.len() < n {
-        buffer = scratch(n);
-    }
-    let r = f(&mut buffer[..n]);
-    PATCHES.with(|p| p.replace(buffer));
-    r
+/// The positions of a result that sum over the same taps.
+struct Class {
+    taps: Vec<usize>,
+    /// For each tap, for each position: where the row begins in its sample, or none.
+    from: Vec<Option<u32>>,
+    /// For each position: where its row begins in its sample of the result.
+    to: Vec<u32>,
 }
 
-/// Where the columns of a patch that starts at `x0` meet an input `w` wide: (first, end) of `kw`.
-#[inline(always)]
-fn overlap(x0: isize, w: usize, kw: usize) -> (usize, usize) {
-    let lo = usize::try_from(-x0).unwrap_or(0).min(kw);
-    let hi = usize::try_from(w as isize - x0).unwrap_or(0).min(kw);
-    (lo, hi.max(lo))
-}
-
-/// Calls `f(patch offset, input offset or None, length)` for every run of numbers in the patches of rows `r0..r1`.
-#[inline(always)]
-fn runs(g: &Geo, r0: usize, r1: usize, mut f: impl FnMut(usize, Option<usize>, usize)) {
-    let (oh, ow, k, c) = (g.out_h(), g.out_w(), g.k(), g.c);
-    let seg = g.kw * c;
-    let (mut bi, mut oy, mut ox) = (r0 / (oh * ow), r0 / ow % oh, r0 % ow);
-    for r in 0..r1 - r0 {
-        let x0 = (ox * g.sw) as isize - g.pw as isize;
-        let (lo, hi) = overlap(x0, g.w, g.kw);
-        for ky in 0..g.kh {
-            let o = r * k + ky * seg;
-            let iy = (oy * g.sh + ky) as isize - g.ph as isize;
-            if iy < 0 || iy >= g.h as isize || lo == hi {
-                f(o, None, seg);
-                continue;
-            }
-            if lo > 0 {
-                f(o, None, lo * c);
-            }
-            let s = ((bi * g.h + iy as usize) * g.w + (x0 + lo as isize) as usize) * c;
-            f(o + lo * c, Some(s), (hi - lo) * c);
-            if hi < g.kw {
-                f(o + hi * c, None, (g.kw - hi) * c);
-            }
-        }
-        ox += 1;
-        if ox == ow {
-            (ox, oy) = (0, oy + 1);
-            if oy == oh {
-                (oy, bi) = (0, bi + 1);
+impl Class {
+    /// Calls `f(i, pointer)` for the row of tap number `t` that each of the rows `rows` of all samples reads.
+    #[inline(always)]
+    fn gather(
+        &self,
+        t: usize,
+        rows: std::ops::Range<usize>,
+        (src, size): (&[f32], usize),
+        zero: &[f32],
+        mut f: impl FnMut(usize, *const f32),
+    ) {
+        let positions = self.to.len();
+        let from = &self.from[t * positions..][..positions];
+        let (mut sample, mut position) = (rows.start / positions, rows.start % positions);
+        let mut base = src[(sample * size).min(src.len())..].as_ptr();
+        for i in 0..rows.len() {
+            // In bounds: `product` and `outer` check `src` against the samples, and `from` stays inside one.
+            f(i, from[position].map_or(zero.as_ptr(), |o| base.wrapping_add(o as usize)));
+            position += 1;
+            if position == positions {
+                (sample, position) = (sample + 1, 0);
+                base = src[(sample * size).min(src.len())..].as_ptr();
             }
         }
     }
 }
 
-simd! {
-/// Copies the patches of output rows `r0..r1`.
-fn gather(x: &[f32], g: &Geo, r0: usize, r1: usize, col: &mut [f32]) {
-    let _ = FMA;
-    runs(g, r0, r1, |o, s, len| match s {
-        Some(s) => col[o..o + len].copy_from_slice(&x[s..s + len]),
-        None => col[o..o + len].fill(0.0),
+#[allow(clippy::cast_possible_truncation, reason = "a sample has fewer than 2^32 numbers")]
+fn narrow(x: usize) -> u32 {
+    x as u32
+}
+
+/// Which input rows every output position reads.
+fn reach(g: &Geo) -> Class {
+    let (oh, ow) = (g.out_h(), g.out_w());
+    let mut from = Vec::with_capacity(g.taps() * g.per());
+    for tap in 0..g.taps() {
+        for oy in 0..oh {
+            let y = (oy * g.sh + tap / g.kw).checked_sub(g.ph).filter(|y| *y < g.h);
+            for ox in 0..ow {
+                let x = (ox * g.sw + tap % g.kw).checked_sub(g.pw).filter(|x| *x < g.w);
+                from.push(y.zip(x).map(|(y, x)| narrow((y * g.w + x) * g.c)));
+            }
+        }
+    }
+    Class { taps: (0..g.taps()).collect(), from, to: (0..g.per()).map(|p| narrow(p * g.n)).collect() }
+}
+
+/// Which rows of the gradient of the output every input position reads: one class for every remainder of the strides.
+fn reach_back(g: &Geo) -> Vec<Class> {
+    let (oh, ow) = (g.out_h(), g.out_w());
+    // Output coordinate that tap `k` connects with input coordinate `i`.
+    let meets = |i: usize, k: usize, pad: usize, stride: usize, out: usize| {
+        (i + pad).checked_sub(k).map(|d| d / stride).filter(|o| *o < out)
+    };
+    let mut all = Vec::with_capacity(g.sh * g.sw);
+    for (ry, rx) in (0..g.sh.min(g.h)).flat_map(|y| (0..g.sw.min(g.w)).map(move |x| (y, x))) {
+        let fits = |tap: &usize| {
+            let same = |r: usize, pad: usize, k: usize, s: usize| (r + pad) % s == k % s;
+            same(ry, g.ph, tap / g.kw, g.sh) && same(rx, g.pw, tap % g.kw, g.sw)
+        };
+        let taps: Vec<usize> = (0..g.taps()).filter(fits).collect();
+        let positions = || (ry..g.h).step_by(g.sh).flat_map(|y| (rx..g.w).step_by(g.sw).map(move |x| (y, x)));
+        let mut from = Vec::new();
+        for tap in &taps {
+            from.extend(positions().map(|(y, x)| {
+                let (oy, ox) = (meets(y, tap / g.kw, g.ph, g.sh, oh), meets(x, tap % g.kw, g.pw, g.sw, ow));
+                oy.zip(ox).map(|(y, x)| narrow((y * ow + x) * g.n))
+            }));
+        }
+        all.push(Class { taps, from, to: positions().map(|(y, x)| narrow((y * g.w + x) * g.c)).collect() });
+    }
+    all
+}
+
+/// For few channels: the input with its border, and the convolution over it whose taps are whole rows of a patch.
+fn merged(x: &[f32], g: &Geo) -> Option<(Vec<f32>, usize, Class)> {
+    if g.c >= NARROW || g.kw == 1 {
+        return None;
+    }
+    let (h, w) = (g.h + 2 * g.ph, g.w + 2 * g.pw);
+    let size = h * w * g.c;
+    let mut wide = vec![0.0; g.b * size];
+    super::each(&mut wide, size, |i, wide| {
+        for y in 0..g.h {
+            let row = &x[i * g.size() + y * g.w * g.c..][..g.w * g.c];
+            wide[((y + g.ph) * w + g.pw) * g.c..][..row.len()].copy_from_slice(row);
+        }
     });
-}
-}
-simd! {
-/// Adds the patches of output rows `r0..r1` to the input positions they came from. `x` starts at sample `b0`.
-fn scatter(x: &mut [f32], b0: usize, g: &Geo, r0: usize, r1: usize, col: &[f32]) {
-    let _ = FMA;
-    let base = b0 * g.h * g.w * g.c;
-    runs(g, r0, r1, |o, s, len| if let Some(s) = s {
-        for (a, b) in x[s - base..][..len].iter_mut().zip(&col[o..o + len]) {
-            *a += *b;
+    let mut from = Vec::with_capacity(g.kh * g.per());
+    for ky in 0..g.kh {
+        for oy in 0..g.out_h() {
+            from.extend((0..g.out_w()).map(|ox| Some(narrow(((oy * g.sh + ky) * w + ox * g.sw) * g.c))));
         }
-    });
-}
+    }
+    let to = (0..g.per()).map(|p| narrow(p * g.n)).collect();
+    Some((wide, size, Class { taps: (0..g.kh).collect(), from, to }))
 }
 
-fn all_patches(x: &[f32], g: &Geo) -> Vec<f32> {
-    let (m, k) = (g.m(), g.k());
-    let rows = (TILE / k.max(1)).max(1);
-    let mut col = scratch(m * k);
-    let fill = |i: usize, c: &mut [f32]| gather(x, g, i * rows, (i * rows + rows).min(m), c);
-    if worthwhile(col.len()) {
-        col.par_chunks_mut(rows * k).enumerate().for_each(|(i, c)| fill(i, c));
+/// A place that tasks write different parts of.
+#[derive(Clone, Copy)]
+struct Place(*mut f32);
+// SAFETY: every task writes rows and columns of its own.
+unsafe impl Send for Place {}
+// SAFETY: as above.
+unsafe impl Sync for Place {}
+impl Place {
+    fn at(self, i: usize) -> *mut f32 {
+        self.0.wrapping_add(i)
+    }
+}
+
+/// What a result is the product of.
+struct Product<'a> {
+    src: &'a [f32],
+    /// Numbers of a sample of `src`, and of the result.
+    src_size: usize,
+    size: usize,
+    samples: usize,
+    /// Matrices `k` by `n`, one a tap, in panels.
+    w: &'a [f32],
+    taps: usize,
+    k: usize,
+    n: usize,
+    bias: Option<&'a [f32]>,
+}
+
+/// `n` split as evenly as can be into parts of at most `most`: part `i` of `parts`.
+fn share(n: usize, parts: usize, i: usize) -> std::ops::Range<usize> {
+    let (each, more) = (n / parts, n % parts);
+    let first = i * each + i.min(more);
+    first..first + each + usize::from(i < more)
+}
+
+fn for_each(tasks: usize, work: usize, f: impl Fn(usize) + Sync + Send) {
+    if tasks > 1 && work >= WORTHWHILE && threads() > 1 {
+        (0..tasks).into_par_iter().for_each(f);
     } else {
-        col.chunks_mut(rows * k).enumerate().for_each(|(i, c)| fill(i, c));
+        (0..tasks).for_each(f);
     }
-    col
 }
 
-fn fill_bias(y: &mut [f32], bias: Option<&[f32]>) {
-    if let Some(b) = bias {
-        y.chunks_exact_mut(b.len()).for_each(|r| r.copy_from_slice(b));
+/// The instruction set for rows of `n` numbers.
+fn isa_for(isa: Isa, n: usize) -> Isa {
+    match isa {
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx512 if n < 16 => Isa::Avx2,
+        isa => isa,
     }
+}
+
+/// Columns in a panel of a matrix of `n`.
+pub(crate) fn panel(n: usize) -> usize {
+    [32, 16].into_iter().find(|w| n.is_multiple_of(*w)).unwrap_or(n)
+}
+
+/// Copies between a matrix of `n` columns row by row and its panels: into them, or with `out` back.
+pub(crate) fn in_panels(x: &[f32], n: usize, out: bool) -> Vec<f32> {
+    let width = panel(n);
+    let rows = x.len() / n.max(1);
+    let mut y = scratch(x.len());
+    for r in 0..rows {
+        for p in 0..n / width {
+            let (plain, paneled) = (r * n + p * width, (p * rows + r) * width);
+            let (to, from) = if out { (plain, paneled) } else { (paneled, plain) };
+            y[to..to + width].copy_from_slice(&x[from..from + width]);
+        }
+    }
+    y
+}
+
+/// The matrices of all taps transposed, `rows` by `cols` to `cols` by `rows`, panels to panels.
+fn flip(w: &[f32], taps: usize, rows: usize, cols: usize) -> Vec<f32> {
+    let (rw, cw) = (panel(rows), panel(cols));
+    let mut y = scratch(w.len());
+    super::each(&mut y, cols * rw, |i, y| {
+        let (r0, t) = (i / taps * rw, i % taps);
+        for (p, y) in y.chunks_exact_mut(cw * rw).enumerate() {
+            let block = &w[((p * taps + t) * rows + r0) * cw..][..rw * cw];
+            for (j, y) in y.chunks_exact_mut(rw).enumerate() {
+                for (y, row) in y.iter_mut().zip(block.chunks_exact(cw)) {
+                    *y = row[j];
+                }
+            }
+        }
+    });
+    y
+}
+
+/// The last columns of rows of `width`, padded to `lanes`.
+fn padded(x: &[f32], width: usize, first: usize, lanes: usize) -> Vec<f32> {
+    let mut out = vec![0.0; x.len() / width.max(1) * lanes];
+    for (o, x) in out.chunks_exact_mut(lanes).zip(x.chunks_exact(width)) {
+        o[..width - first].copy_from_slice(&x[first..]);
+    }
+    out
+}
+
+fn product(isa: Isa, classes: &[Class], p: &Product<'_>) -> Vec<f32> {
+    let isa = isa_for(isa, p.n);
+    let lanes = isa.lanes();
+    let width = panel(p.n);
+    // Only a matrix of one panel can have columns that fill no register.
+    let whole = width / lanes * lanes;
+    let rest = width - whole;
+    assert!(
+        p.w.len() >= p.taps * p.k * p.n && p.src.len() >= p.samples * p.src_size,
+        "product outside its slices"
+    );
+    let tail = if rest > 0 { padded(p.w, width, whole, lanes) } else { Vec::new() };
+    let tail_bias = p.bias.filter(|_| rest > 0).map(|b| padded(b, width, whole, lanes));
+    let zero = vec![0.0; p.k];
+    let mut y = scratch(p.samples * p.size);
+    let place = Place(y.as_mut_ptr());
+    let per_panel = width.div_ceil(2 * lanes);
+    let strips = p.n / width * per_panel;
+    for class in classes {
+        let positions = class.to.len();
+        let rows = p.samples * positions;
+        if rows == 0 {
+            continue;
+        }
+        let chunks = rows.div_ceil(TILES * isa.rows());
+        let groups = TASKS.div_ceil(chunks).min(strips);
+        let count = class.taps.len();
+        let task = |i: usize| {
+            let (rows, strips) = (share(rows, chunks, i / groups), share(strips, groups, i % groups));
+            let tiles = rows.len().div_ceil(isa.rows());
+            let mut at = vec![null(); tiles * count * MAX_ROWS];
+            let mut to = vec![place.at(0); tiles * MAX_ROWS];
+            for tile in 0..tiles {
+                let own = share(rows.len(), tiles, tile);
+                let own = rows.start + own.start..rows.start + own.end;
+                for t in 0..count {
+                    let at = &mut at[(tile * count + t) * MAX_ROWS..][..MAX_ROWS];
+                    class.gather(t, own.clone(), (p.src, p.src_size), &zero, |i, row| at[i] = row);
+                }
+                for (to, r) in to[tile * MAX_ROWS..].iter_mut().zip(own) {
+                    *to = place.at(r / positions * p.size + class.to[r % positions] as usize);
+                }
+            }
+            let tails: Vec<*const f32> = if rest > 0 {
+                class.taps.iter().map(|t| tail[t * p.k * lanes..].as_ptr()).collect()
+            } else {
+                Vec::new()
+            };
+            for strip in strips {
+                let (number, first) = (strip / per_panel, strip % per_panel * 2 * lanes);
+                let own = &p.w[number * p.taps * p.k * width..];
+                let matrices: Vec<*const f32> =
+                    class.taps.iter().map(|t| own[t * p.k * width..].as_ptr()).collect();
+                let columns = (whole - first.min(whole)).min(2 * lanes) / lanes;
+                let column = number * width + first;
+                for tile in 0..tiles {
+                    let height = share(rows.len(), tiles, tile).len();
+                    let (at, to) = (&at[tile * count * MAX_ROWS..], &to[tile * MAX_ROWS..]);
+                    if columns > 0 {
+                        let t = Rows {
+                            taps: count,
+                            k: p.k,
+                            at: at.as_ptr(),
+                            w: matrices.as_ptr(),
+                            w_column: first,
+                            row_step: width,
+                            to: to.as_ptr(),
+                            column,
+                            start: p.bias.map_or(Start::Zero, |b| Start::Bias(b[column..].as_ptr())),
+                        };
+                        // SAFETY: rows of `src` and `w` were checked against their slices above, and of the result
+                        // each task has rows and columns of its own.
+                        unsafe { isa.rows_tile(height, columns, &t) };
+                    }
+                    if rest > 0 && first + 2 * lanes >= width {
+                        let mut own = [0.0f32; MAX_ROWS * 16];
+                        let own_to: [*mut f32; MAX_ROWS] =
+                            std::array::from_fn(|i| own.as_mut_ptr().wrapping_add(i * 16));
+                        let t = Rows {
+                            taps: count,
+                            k: p.k,
+                            at: at.as_ptr(),
+                            w: tails.as_ptr(),
+                            w_column: 0,
+                            row_step: lanes,
+                            to: own_to.as_ptr(),
+                            column: 0,
+                            start: tail_bias.as_ref().map_or(Start::Zero, |b| Start::Bias(b.as_ptr())),
+                        };
+                        // SAFETY: as above; `own` has room for every row of a register.
+                        unsafe { isa.rows_tile(height, 1, &t) };
+                        for (to, own) in to[..height].iter().zip(own.chunks_exact(16)) {
+                            for (j, v) in own[..rest].iter().enumerate() {
+                                // SAFETY: columns of this task's rows.
+                                unsafe { *to.add(whole + j) = *v };
+                            }
+                        }
+                    }
+                }
+            }
+        };
+        for_each(chunks * groups, rows * count * p.k * p.n, task);
+    }
+    y
 }
 
 /// y = conv(x, w) + bias, with `w` of `(kh, kw, c)` by `n`.
 pub(crate) fn forward(x: &[f32], w: &[f32], bias: Option<&[f32]>, g: &Geo) -> Vec<f32> {
-    let (m, n, k) = (g.m(), g.n, g.k());
-    let mut y = scratch(m * n);
-    let (w, add) = (Mat::rows(w, n), bias.is_some());
-    if m <= FEW {
-        fill_bias(&mut y, bias);
-        if g.pointwise() {
-            matmul((m, n, k), &mut y, add, Mat::rows(x, k), w, true);
-        } else {
-            matmul((m, n, k), &mut y, add, Mat::rows(&all_patches(x, g), k), w, true);
-        }
-        return y;
+    forward_with(Isa::best(), x, w, bias, g)
+}
+
+fn forward_with(isa: Isa, x: &[f32], w: &[f32], bias: Option<&[f32]>, g: &Geo) -> Vec<f32> {
+    let size = g.per() * g.n;
+    let of = |src, src_size, taps, k| Product { src, src_size, size, samples: g.b, w, taps, k, n: g.n, bias };
+    match merged(x, g) {
+        Some((wide, size, class)) => product(isa, &[class], &of(&wide, size, g.kh, g.kw * g.c)),
+        None => product(isa, &[reach(g)], &of(x, g.size(), g.taps(), g.c)),
     }
-    let t = g.tile();
-    let tile = |i: usize, y: &mut [f32]| {
-        let (r0, rows) = (i * t, y.len() / n);
-        fill_bias(y, bias);
-        if g.pointwise() {
-            return matmul((rows, n, k), y, add, Mat::rows(&x[r0 * k..], k), w, false);
-        }
-        with_patches(t * k, |col| {
-            gather(x, g, r0, r0 + rows, col);
-            matmul((rows, n, k), y, add, Mat::rows(col, k), w, false);
-        });
-    };
-    super::each(&mut y, t * n, tile);
-    y
-}
-
-/// The kernel that turns the gradient of the result into that of the input by a convolution: taps reversed, channels
-/// swapped.
-fn flipped(w: &[f32], g: &Geo) -> Vec<f32> {
-    let (taps, c, n) = (g.kh * g.kw, g.c, g.n);
-    let mut out = scratch(w.len());
-    let one = |t: usize, o: &mut [f32]| transpose(&w[(taps - 1 - t) * c * n..][..c * n], c, n, o);
-    super::each(&mut out, c * n, one);
-    out
-}
-
-/// `o[j][i] = w[i][j]` for `w` of `rows` by `cols`, by blocks that stay in the first-level cache.
-fn transpose(w: &[f32], rows: usize, cols: usize, o: &mut [f32]) {
-    const B: usize = 16;
-    for i0 in (0..rows).step_by(B) {
-        for j0 in (0..cols).step_by(B) {
-            for j in j0..(j0 + B).min(cols) {
-                for i in i0..(i0 + B).min(rows) {
-                    o[j * rows + i] = w[i * cols + j];
-                }
-            }
-        }
-    }
-}
-
-/// Spreads `rows(r0, r1) -> patches` over the input positions: `x` is set to `bias` (or 0) and added to, some samples a task.
-fn spread(g: &Geo, bias: Option<&[f32]>, product: impl Fn(usize, usize, &mut [f32]) + Sync) -> Vec<f32> {
-    let (k, per, size) = (g.k(), g.per(), g.h * g.w * g.c);
-    let t = g.tile();
-    let samples = (t / per.max(1)).max(1);
-    let mut x = scratch(g.b * size);
-    super::each(&mut x, samples * size, |i, x| {
-        match bias {
-            Some(_) => fill_bias(x, bias),
-            None => x.fill(0.0),
-        }
-        let b0 = i * samples;
-        let end = (b0 + x.len() / size.max(1)) * per;
-        with_patches(t * k, |col| {
-            let mut r = b0 * per;
-            while r < end {
-                let r1 = (r + t).min(end);
-                product(r, r1, col);
-                scatter(x, b0, g, r, r1, col);
-                r = r1;
-            }
-        });
-    });
-    x
 }
 
 /// The gradient of the input.
 pub(crate) fn input_grad(w: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
-    let (n, k) = (g.n, g.k());
-    if g.sh == 1 && g.sw == 1 && g.ph < g.kh && g.pw < g.kw {
-        let back =
-            Geo { h: g.out_h(), w: g.out_w(), c: n, n: g.c, ph: g.kh - 1 - g.ph, pw: g.kw - 1 - g.pw, ..*g };
-        return forward(dy, &flipped(w, g), None, &back);
-    }
-    let mut wt = scratch(w.len());
-    transpose(w, k, n, &mut wt);
-    spread(g, None, |r0, r1, col| {
-        matmul((r1 - r0, k, n), col, false, Mat::rows(&dy[r0 * n..], n), Mat::rows(&wt, k), false);
-    })
+    input_grad_with(Isa::best(), w, dy, g)
+}
+
+fn input_grad_with(isa: Isa, w: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
+    let wt = flip(w, g.taps(), g.c, g.n);
+    let p = Product {
+        src: dy,
+        src_size: g.per() * g.n,
+        size: g.size(),
+        samples: g.b,
+        w: &wt,
+        taps: g.taps(),
+        k: g.n,
+        n: g.c,
+        bias: None,
+    };
+    product(isa, &reach_back(g), &p)
 }
 
 /// The gradient of the weights, `(kh, kw, c)` by `n`.
 pub(crate) fn weight_grad(x: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
-    let (m, n, k) = (g.m(), g.n, g.k());
-    if m <= FEW {
-        let mut dw = scratch(k * n);
-        let own;
-        let col = if g.pointwise() {
-            x
-        } else {
-            own = all_patches(x, g);
-            &own
-        };
-        matmul((k, n, m), &mut dw, false, Mat::transposed(col, k), Mat::rows(dy, n), true);
-        return dw;
-    }
-    let t = g.tile();
-    let parts = PARTS.min(m.div_ceil(FEW / 2));
-    let rows = m.div_ceil(parts).div_ceil(t) * t;
-    let part = |i: usize| {
-        let (mut r, end) = (i * rows, (i * rows + rows).min(m));
-        let mut dw = scratch(k * n);
-        let mut add = false;
-        while r < end {
-            let r1 = (r + t).min(end);
-            if g.pointwise() {
-                let a = Mat::transposed(&x[r * k..], k);
-                matmul((k, n, r1 - r), &mut dw, add, a, Mat::rows(&dy[r * n..], n), false);
-            } else {
-                with_patches(t * k, |col| {
-                    gather(x, g, r, r1, col);
-                    let a = Mat::transposed(col, k);
-                    matmul((k, n, r1 - r), &mut dw, add, a, Mat::rows(&dy[r * n..], n), false);
-                });
-            }
-            (r, add) = (r1, true);
-        }
-        dw
-    };
-    sum_parts(m.div_ceil(rows), part)
+    weight_grad_with(Isa::best(), x, dy, g)
 }
 
-/// `part(0) + part(1) + ...`, in that order.
-fn sum_parts(count: usize, part: impl Fn(usize) -> Vec<f32> + Sync + Send) -> Vec<f32> {
-    let parts: Vec<Vec<f32>> = if super::threads() > 1 {
-        (0..count).into_par_iter().map(&part).collect()
-    } else {
-        (0..count).map(&part).collect()
+fn weight_grad_with(isa: Isa, x: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
+    match merged(x, g) {
+        Some((wide, size, class)) => outer(isa, &class, (&wide, size, g.kw * g.c), dy, g),
+        None => outer(isa, &reach(g), (x, g.size(), g.c), dy, g),
+    }
+}
+
+/// For every tap of `class`, the sum over positions of (row of `x`)ᵀ (row of `dy`). `x`: numbers, of a sample, of a row.
+fn outer(isa: Isa, class: &Class, x: (&[f32], usize, usize), dy: &[f32], g: &Geo) -> Vec<f32> {
+    let (x, size, c) = x;
+    let (n, m) = (g.n, g.m());
+    let isa = isa_for(isa, n);
+    let lanes = isa.lanes();
+    let width = panel(n);
+    let whole = width / lanes * lanes;
+    let tail = if whole < width { padded(dy, n, whole, lanes) } else { Vec::new() };
+    let zero = vec![0.0; c];
+    let blocks = c.div_ceil(isa.rows());
+    assert!(dy.len() >= m * n && x.len() >= g.b * size, "weight gradient outside its slices");
+    let taps = class.taps.len();
+    // Sums tap `t`, channels `channels`, over the rows of `at` into the gradient at `dw`.
+    let block = |at: &[*const f32],
+                 r0: usize,
+                 t: usize,
+                 channels: std::ops::Range<usize>,
+                 dw: *mut f32,
+                 keep: bool| {
+        for number in 0..n / width {
+            let to = dw.wrapping_add(((number * taps + t) * c + channels.start) * width);
+            let mut t = Outer {
+                rows: at.len(),
+                at: at.as_ptr(),
+                first: channels.start,
+                b: null(),
+                b_step: n,
+                to,
+                to_step: width,
+                keep,
+            };
+            for column in (0..whole).step_by(2 * lanes) {
+                t.b = dy[r0 * n + number * width + column..].as_ptr();
+                t.to = to.wrapping_add(column);
+                // SAFETY: `at` holds rows of `c` numbers, `dy` has the rows, and `to` rows of `width` numbers that are this
+                // task's own.
+                unsafe { isa.outer_tile(channels.len(), ((whole - column) / lanes).min(2), &t) };
+            }
+            if whole < width {
+                let mut own = [0.0f32; MAX_ROWS * 16];
+                t = Outer {
+                    b: tail[r0 * lanes..].as_ptr(),
+                    b_step: lanes,
+                    to: own.as_mut_ptr(),
+                    to_step: 16,
+                    keep: false,
+                    ..t
+                };
+                // SAFETY: as above; `own` has room for every row of a register.
+                unsafe { isa.outer_tile(channels.len(), 1, &t) };
+                for (i, own) in own.chunks_exact(16).take(channels.len()).enumerate() {
+                    for (j, v) in own[..width - whole].iter().enumerate() {
+                        let to = to.wrapping_add(i * width + whole + j);
+                        // SAFETY: a number of this task's own rows.
+                        unsafe { *to = if keep { *to + *v } else { *v } };
+                    }
+                }
+            }
+        }
     };
-    let mut parts = parts.into_iter();
-    let mut sum = parts.next().unwrap_or_default();
-    parts.for_each(|p: Vec<f32>| add_assign(&mut sum, &p));
-    sum
+    let rows_of = |at: &mut Vec<*const f32>, t: usize, r0: usize, r1: usize| {
+        at.clear();
+        class.gather(t, r0..r1, (x, size), &zero, |_, row| at.push(row));
+    };
+    let work = m * taps * c * n;
+    if taps * c * n >= LARGE || m <= BLOCK {
+        let mut dw = scratch(taps * c * n);
+        let place = Place(dw.as_mut_ptr());
+        for_each(taps * blocks, work, |i| {
+            let (t, channels) = (i / blocks, share(c, blocks, i % blocks));
+            let mut at = Vec::with_capacity(BLOCK);
+            for r0 in (0..m).step_by(BLOCK) {
+                rows_of(&mut at, t, r0, (r0 + BLOCK).min(m));
+                block(&at, r0, t, channels.clone(), place.at(0), r0 > 0);
+            }
+        });
+        return dw;
+    }
+    let parts = PARTS.min(m.div_ceil(BLOCK));
+    let mut sums = scratch(parts * taps * c * n);
+    let place = Place(sums.as_mut_ptr());
+    for_each(parts, work, |part| {
+        let rows = share(m, parts, part);
+        let mut at = Vec::with_capacity(BLOCK);
+        for r0 in rows.clone().step_by(BLOCK) {
+            for t in 0..taps {
+                rows_of(&mut at, t, r0, (r0 + BLOCK).min(rows.end));
+                for channels in (0..blocks).map(|i| share(c, blocks, i)) {
+                    block(&at, r0, t, channels.clone(), place.at(part * taps * c * n), r0 > rows.start);
+                }
+            }
+        }
+    });
+    let more = sums.split_off(taps * c * n);
+    for part in more.chunks_exact(taps * c * n) {
+        add_assign(&mut sums, part);
+    }
+    sums
 }
 
 /// Transposed convolution from `(b, out_h, out_w, n)` to `(b, h, w, c)`: the input gradient of the convolution `g`, here
-/// with `w` of `n` by `(kh, kw, c)` and a bias of `c`.
+/// with `w` of `(kh, kw, n)` by `c` and a bias of `c`.
 pub(crate) fn transposed_forward(x: &[f32], w: &[f32], bias: &[f32], g: &Geo) -> Vec<f32> {
-    let (n, k) = (g.n, g.k());
-    if g.m() <= FEW {
-        let mut all = scratch(g.m() * k);
-        matmul((g.m(), k, n), &mut all, false, Mat::rows(x, n), Mat::rows(w, k), true);
-        return spread(g, Some(bias), |r0, r1, col| {
-            let rows = &all[r0 * k..r1 * k];
-            col[..rows.len()].copy_from_slice(rows);
-        });
-    }
-    spread(g, Some(bias), |r0, r1, col| {
-        matmul((r1 - r0, k, n), col, false, Mat::rows(&x[r0 * n..], n), Mat::rows(w, k), false);
-    })
+    transposed_forward_with(Isa::best(), x, w, bias, g)
+}
+
+fn transposed_forward_with(isa: Isa, x: &[f32], w: &[f32], bias: &[f32], g: &Geo) -> Vec<f32> {
+    let p = Product {
+        src: x,
+        src_size: g.per() * g.n,
+        size: g.size(),
+        samples: g.b,
+        w,
+        taps: g.taps(),
+        k: g.n,
+        n: g.c,
+        bias: Some(bias),
+    };
+    product(isa, &reach_back(g), &p)
 }
 
 /// The gradient of the input of [`transposed_forward`].
 pub(crate) fn transposed_input_grad(w: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
-    let (n, k) = (g.n, g.k());
-    let mut wt = scratch(w.len());
-    transpose(w, n, k, &mut wt);
-    forward(dy, &wt, None, g)
+    forward(dy, &flip(w, g.taps(), g.n, g.c), None, g)
 }
 
-/// The gradient of the weights of [`transposed_forward`], `n` by `(kh, kw, c)`.
+/// The gradient of the weights of [`transposed_forward`].
 pub(crate) fn transposed_weight_grad(x: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
     // The roles of x and dy are those of the plain convolution exchanged, so the result comes out transposed.
-    let dw = weight_grad(dy, x, g);
-    let mut out = scratch(dw.len());
-    transpose(&dw, g.k(), g.n, &mut out);
-    out
+    flip(&weight_grad(dy, x, g), g.taps(), g.c, g.n)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    fn geometries() -> Vec<Geo> {
+        let d2 = |b, side, c, n, k, s, p| Geo {
+            b,
+            h: side,
+            w: side + 1,
+            c,
+            n,
+            kh: k,
+            kw: k,
+            sh: s,
+            sw: s,
+            ph: p,
+            pw: p,
+        };
+        let d1 = |b, w, c, n, k, s, p| Geo { b, h: 1, w, c, n, kh: 1, kw: k, sh: 1, sw: s, ph: 0, pw: p };
+        vec![
+            d2(3, 9, 3, 16, 7, 2, 3),
+            d2(2, 8, 16, 16, 3, 1, 1),
+            d2(2, 7, 17, 33, 3, 2, 1),
+            d2(2, 6, 32, 48, 1, 2, 0),
+            d2(1, 2, 20, 70, 3, 1, 1),
+            d2(40, 5, 16, 24, 3, 1, 1),
+            d1(5, 16, 8, 64, 5, 1, 2),
+            d1(3, 16, 24, 8, 1, 1, 0),
+            d1(2, 8, 40, 40, 3, 2, 1),
+            d1(4, 16, 12, 20, 4, 2, 1),
+            d1(1, 4, 300, 130, 5, 1, 2),
+            Geo::linear(130, 70, 90),
+        ]
+    }
+
+    fn random(n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+        (0..n).map(|_| rng.random::<f32>() - 0.5).collect()
+    }
+
+    /// Calls `f(input, output, weight)` with the indices of every product, in `f64` loops.
+    fn naive(g: &Geo, mut f: impl FnMut(usize, usize, usize)) {
+        for b in 0..g.b {
+            for (oy, ox) in (0..g.out_h()).flat_map(|y| (0..g.out_w()).map(move |x| (y, x))) {
+                for tap in 0..g.taps() {
+                    let y = (oy * g.sh + tap / g.kw).checked_sub(g.ph).filter(|y| *y < g.h);
+                    let x = (ox * g.sw + tap % g.kw).checked_sub(g.pw).filter(|x| *x < g.w);
+                    let Some((y, x)) = y.zip(x) else { continue };
+                    for (c, n) in (0..g.c).flat_map(|c| (0..g.n).map(move |n| (c, n))) {
+                        f(
+                            ((b * g.h + y) * g.w + x) * g.c + c,
+                            ((b * g.out_h() + oy) * g.out_w() + ox) * g.n + n,
+                            (tap * g.c + c) * g.n + n,
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    fn close(what: &str, g: &Geo, isa: Isa, found: &[f32], expected: &[f64]) {
+        assert_eq!(found.len(), expected.len());
+        let scale = expected.iter().fold(1e-3f64, |m, v| m.max(v.abs()));
+        for (i, (a, b)) in found.iter().zip(expected).enumerate() {
+            assert!((f64::from(*a) - b).abs() < 2e-6 * scale, "{what} {g:?} {isa:?} at {i}: {a} for {b}");
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_computes_the_plain_sums() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        for g in geometries() {
+            let x = random(g.b * g.size(), &mut rng);
+            let w = random(g.taps() * g.c * g.n, &mut rng);
+            let bias = random(g.n, &mut rng);
+            let dy = random(g.m() * g.n, &mut rng);
+            let mut y: Vec<f64> = (0..dy.len()).map(|i| f64::from(bias[i % g.n])).collect();
+            let mut dx = vec![0.0; x.len()];
+            let mut dw = vec![0.0; w.len()];
+            naive(&g, |i, o, k| {
+                y[o] += f64::from(x[i]) * f64::from(w[k]);
+                dx[i] += f64::from(dy[o]) * f64::from(w[k]);
+                dw[k] += f64::from(dy[o]) * f64::from(x[i]);
+            });
+            let dw = dw.iter().map(|v| *v as f32).collect::<Vec<_>>();
+            let dw: Vec<f64> = in_panels(&dw, g.n, false).into_iter().map(f64::from).collect();
+            let w = in_panels(&w, g.n, false);
+            // The same numbers as the transposed layer has them: (taps, n) by c.
+            let wt = flip(&w, g.taps(), g.c, g.n);
+            let bias_c = random(g.c, &mut rng);
+            let up: Vec<f64> = dx.iter().enumerate().map(|(i, v)| v + f64::from(bias_c[i % g.c])).collect();
+            for isa in Isa::all() {
+                close("forward", &g, isa, &forward_with(isa, &x, &w, Some(&bias), &g), &y);
+                close("input", &g, isa, &input_grad_with(isa, &w, &dy, &g), &dx);
+                close("weight", &g, isa, &weight_grad_with(isa, &x, &dy, &g), &dw);
+                close("transposed", &g, isa, &transposed_forward_with(isa, &dy, &wt, &bias_c, &g), &up);
+            }
+        }
+    }
+
+    #[test]
+    fn sums_do_not_depend_on_the_threads() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        for g in geometries() {
+            let x = random(g.b * g.size(), &mut rng);
+            let w = in_panels(&random(g.taps() * g.c * g.n, &mut rng), g.n, false);
+            let dy = random(g.m() * g.n, &mut rng);
+            let all = || (forward(&x, &w, None, &g), input_grad(&w, &dy, &g), weight_grad(&x, &dy, &g));
+            let run = |n| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(all);
+            let one = run(1);
+            assert!(one == run(2) && one == run(3), "{g:?}");
+        }
+    }
 }

@@ -1,20 +1,21 @@
-//! Loops over `f32` slices, channels last. The only place with `unsafe`: calls to `gemm`, buffers that are written before
-//! they are read, and functions compiled for AVX2.
+//! Loops over `f32` slices, channels last. The only place with `unsafe`: tiles that live in registers, buffers that are
+//! written before they are read, and functions compiled for AVX2 and AVX-512.
 //!
 //! Work is cut by the sizes of the data, never by the number of threads, and partial sums are added in that fixed order:
 //! the same inputs give the same bytes in any pool.
 #![allow(
     unsafe_code,
-    reason = "gemm takes pointers, and AVX2 code must be called behind a check of the processor"
+    reason = "tiles take pointers, and vector code must be called behind a check of the processor"
 )]
 
 pub(crate) mod act;
 pub(crate) mod conv;
+mod micro;
 pub(crate) mod norm;
 pub(crate) mod optim;
 pub(crate) mod pool;
+mod vector;
 
-use gemm::Parallelism;
 use rayon::prelude::*;
 
 /// Below this many elements a loop stays on the calling thread: waking another costs more than it saves.
@@ -83,73 +84,6 @@ macro_rules! simd {
     };
 }
 pub(crate) use simd;
-
-/// A matrix inside a slice: element (i, j) is `data[i * row + j * col]`.
-#[derive(Clone, Copy)]
-pub(crate) struct Mat<'a> {
-    pub(crate) data: &'a [f32],
-    pub(crate) row: usize,
-    pub(crate) col: usize,
-}
-
-impl<'a> Mat<'a> {
-    /// Rows of `width` numbers one after the other.
-    pub(crate) fn rows(data: &'a [f32], width: usize) -> Self {
-        Self { data, row: width, col: 1 }
-    }
-
-    /// The transpose of [`Mat::rows`].
-    pub(crate) fn transposed(data: &'a [f32], width: usize) -> Self {
-        Self { data, row: 1, col: width }
-    }
-}
-
-/// `c = a b`, or `c += a b`, with `c` of `m` rows of `n` numbers and `k` products in each.
-///
-/// `spread` lets the threads of the pool share the product. Each element is still one sum in the order of `k`, so the
-/// result does not depend on it.
-pub(crate) fn matmul(
-    dims: (usize, usize, usize),
-    c: &mut [f32],
-    add: bool,
-    a: Mat<'_>,
-    b: Mat<'_>,
-    spread: bool,
-) {
-    let (m, n, k) = dims;
-    if m == 0 || n == 0 {
-        return;
-    }
-    let fits =
-        |x: Mat<'_>, r: usize, q: usize| r == 0 || q == 0 || (r - 1) * x.row + (q - 1) * x.col < x.data.len();
-    assert!(c.len() >= m * n && fits(a, m, k) && fits(b, k, n), "matrix product outside its slices");
-    let many = if spread { threads() } else { 1 };
-    let parallelism = if many > 1 { Parallelism::Rayon(many) } else { Parallelism::None };
-    // SAFETY: the assertion above bounds every index that gemm forms from these sizes and strides.
-    unsafe {
-        gemm::gemm(
-            m,
-            n,
-            k,
-            c.as_mut_ptr(),
-            1,
-            n as isize,
-            add,
-            a.data.as_ptr(),
-            a.col as isize,
-            a.row as isize,
-            b.data.as_ptr(),
-            b.col as isize,
-            b.row as isize,
-            1.0,
-            1.0,
-            false,
-            false,
-            false,
-            parallelism,
-        );
-    }
-}
 
 simd! {
 /// `a += b`.

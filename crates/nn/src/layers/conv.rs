@@ -197,7 +197,7 @@ impl ConvTranspose1d {
         positive("transposed convolution channels", &[from, to])?;
         // PyTorch takes the second axis of the weight for its fan in.
         let bound = Init::Uniform(1.0 / ((to * Self::KERNEL) as f32).sqrt());
-        let weight = builder.weight("weight", &[from, to, Self::KERNEL], Some(&[0, 2, 1]), bound)?;
+        let weight = builder.weight("weight", &[from, to, Self::KERNEL], Some(&[2, 0, 1]), bound)?;
         Ok(Self { weight, bias: builder.weight("bias", &[to], None, bound)?, from, to })
     }
 

@@ -4,7 +4,7 @@ use crate::{Error, Result};
 use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
 use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
-use e2h_refine::{AdvantageConfig, GateConfig, KinematicConfig, ReverseConfig, SuffixConfig};
+use e2h_refine::{AdvantageConfig, GateConfig, GoalConfig, KinematicConfig, ReverseConfig, SuffixConfig};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
@@ -125,6 +125,8 @@ pub struct RefineConfig {
     pub kinematic: KinematicConfig,
     /// A valid reversal grasps once and lets go once.
     pub gate: GateConfig,
+    /// A reversal ends no further out than demonstrations do.
+    pub goal: GoalConfig,
     /// Equation 10.
     pub advantage: AdvantageConfig,
     /// Optional cut of the suffix.

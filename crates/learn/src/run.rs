@@ -15,7 +15,7 @@ use e2h_core::{Direction, Episode, Kind, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_env::{Env, Task, demonstrate};
 use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData, train_critic};
-use e2h_refine::{Refined, critic_filter, gate, kinematic_filter, reverse};
+use e2h_refine::{Goal, Refined, critic_filter, gate, kinematic_filter, reverse};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -392,8 +392,15 @@ impl Run {
         let clock = Instant::now();
         let mut notes = vec![];
         let reversed: Vec<Episode> = collected.easy.iter().map(|e| reverse(e, &r.reverse)).collect();
-        let candidates: Vec<Episode> =
+        let mut candidates: Vec<Episode> =
             reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
+        if let Some(goal) = Goal::fit(&base.hard_training, &r.goal) {
+            let before = candidates.len();
+            if r.goal.enabled {
+                candidates.retain(|e| goal.accepts(e));
+            }
+            notes.push(goal_note(&goal, &collected.hard, candidates.len(), before));
+        }
         let kinematic: Vec<Refined> = candidates
             .iter()
             .map(|e| {
@@ -486,6 +493,19 @@ impl Run {
     pub fn task(&self) -> &Arc<dyn Task> {
         &self.task
     }
+}
+
+/// Where successes leave the object: what tells a loop that walks to the edge of its goal from one that does not.
+fn goal_note(goal: &Goal, hard: &[Episode], kept: usize, of: usize) -> String {
+    let successes = hard.iter().filter(|e| e.outcome.is_success());
+    let mut ends: Vec<f64> = successes.filter_map(|e| goal.distance(e)).collect();
+    ends.sort_by(f64::total_cmp);
+    let median = ends.get(ends.len() / 2).map_or_else(|| "no".to_owned(), |d| format!("{:.1}", 1000.0 * d));
+    format!(
+        "goals: successes end {median} mm from the mean demonstrated goal (median), the gate is at {:.1} mm; {kept} of {of} \
+         reversals kept",
+        1000.0 * goal.radius
+    )
 }
 
 /// Sets how many threads compute; never changes a result. A pool that is already running stays as it is.

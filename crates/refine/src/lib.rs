@@ -29,6 +29,7 @@ mod error;
 mod fate;
 #[cfg(test)]
 mod fixture;
+mod goal;
 mod gripper;
 mod kinematic;
 mod motion;
@@ -43,6 +44,7 @@ pub use advantage::{AdvantageConfig, advantage_filter, advantages};
 pub use compose::{critic_filter, refine_reversed};
 pub use error::{Error, Result};
 pub use fate::{Fate, RefineReport, Refined, merge_fates};
+pub use goal::{Goal, GoalConfig};
 pub use gripper::{GateConfig, gate, gripper_switches};
 pub use kinematic::{KinematicConfig, kinematic_filter};
 pub use reverse::{ReverseConfig, rebuild_actions, reverse};

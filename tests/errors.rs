@@ -30,7 +30,7 @@ fn a_run_directory_is_never_overwritten() {
     assert_success(&nut_assembly(&out, &["--set=loop.iterations=0"]).output().unwrap());
     fails(&mut nut_assembly(&out, &["--set=loop.iterations=0"]), &["exists", "--resume"]);
     fails(
-        &mut nut_assembly(&out, &["--resume", "--set=loop.iterations=1"]),
+        &mut nut_assembly(&out, &["--resume", "--set=loop.iterations=0", "--set=loop.cycles=1"]),
         &["config.toml", "expected", "found"],
     );
     fails(

@@ -43,3 +43,17 @@ fn a_run_killed_at_random_instants_ends_with_the_same_bytes_whatever_the_threads
     assert!(kills >= 2, "the run was never killed");
     assert_same_results(&whole, &killed);
 }
+
+#[test]
+fn a_run_made_longer_goes_on_as_if_it_had_been_that_long() {
+    let dir = tempfile::tempdir().unwrap();
+    let (whole, longer) = (dir.path().join("whole"), dir.path().join("longer"));
+    assert_success(&nut_assembly(&whole, &["--set=loop.iterations=1"]).output().unwrap());
+    assert_success(&nut_assembly(&longer, &["--set=loop.iterations=0"]).output().unwrap());
+    assert_success(&nut_assembly(&longer, &["--resume", "--set=loop.iterations=1"]).output().unwrap());
+    let weights =
+        |run: &std::path::Path| std::fs::read(run.join("iteration_01/policy/model.safetensors")).unwrap();
+    assert!(weights(&whole) == weights(&longer));
+    let config = |run: &std::path::Path| std::fs::read_to_string(run.join("config.toml")).unwrap();
+    assert_eq!(config(&whole), config(&longer));
+}

@@ -42,6 +42,15 @@ fn sync(dir: &Path) -> Result<()> {
     std::fs::File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
 }
 
+fn differs_in_iterations_only(a: &str, b: &str) -> bool {
+    let without = |text: &str| {
+        let mut table = text.parse::<toml::Table>().ok()?;
+        table.get_mut("loop")?.as_table_mut()?.remove("iterations")?;
+        Some(table)
+    };
+    without(a).is_some_and(|a| without(b).is_some_and(|b| a == b))
+}
+
 impl Directory {
     /// Makes a new run directory, or goes on with one of the same run.
     pub(crate) fn open(
@@ -84,7 +93,10 @@ impl Directory {
         }
         let config = path.join("config.toml");
         let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;
-        if text != resolved.text {
+        if text != resolved.text && differs_in_iterations_only(&text, &resolved.text) {
+            // A run can be made longer (or shorter): no stage that is done depends on how many follow.
+            write_atomic(&config, resolved.text.as_bytes())?;
+        } else if text != resolved.text {
             let line = resolved.text.lines().zip(text.lines()).find(|(a, b)| a != b);
             let (expected, found) = line.unwrap_or(("the configuration given", "another one"));
             return differs("config.toml", expected.to_owned(), found.to_owned());

@@ -26,11 +26,13 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod atomic;
 mod crop;
 mod error;
 mod file;
 #[cfg(test)]
 mod fixture;
+pub mod lerobot;
 mod normalise;
 mod sample;
 mod store;

@@ -201,6 +201,65 @@ def foreign(root, video):
           + (" with a video" if video else ""))
 
 
+def refined(source, root):
+    """What the refine example wrote follows from the recording: images, joints and poses of the rows it names, backwards."""
+    recording, result = open_dataset(source), open_dataset(root)
+    starts = recording.meta.episodes["dataset_from_index"]
+    backwards = 0
+    for i in range(len(result)):
+        item = result[i]
+        row = starts[int(item["source.episode"])] + int(item["source.frame"])
+        original = recording[row]
+        assert torch.equal(item["observation.images.front"], original["observation.images.front"]), i
+        state, joints = item["observation.state"], original["observation.state"]
+        assert torch.equal(state[8:], joints), (i, state[8:], joints)
+        # Poses lie between rows: at most half a row of the fastest motion, 5 mm at 30 Hz, and what re-timing moves.
+        assert (state[:3] - original["observation.tcp"][:3]).norm() < 0.006, i
+        assert abs(state[7] - original["observation.jaw_mm"] / 1000) < 0.008, i
+        quaternion = original["observation.tcp"][[6, 3, 4, 5]]
+        assert abs(abs(state[3:7] @ quaternion) - 1) < 1e-3, i
+        assert item["source.reversed"] and item["task"] == "plug it in"
+        last = i + 1 == len(result) or int(result[i + 1]["frame_index"]) == 0
+        assert bool(item["next.success"]) == last
+        if not last:
+            following = result[i + 1]
+            backwards += int(following["source.frame"]) < int(item["source.frame"])
+            assert torch.allclose(item["action"][:7], following["observation.state"][:7], atol=1e-5), i
+            assert item["action"][7] in (0.0, 1.0)
+    episodes = result.num_episodes
+    assert backwards == len(result) - episodes, (backwards, len(result), episodes)
+    assert len(result) < len(recording) * 20 / 30, "pauses were cut"
+    report = json.load(open(Path(root) / "report/report.json"))
+    fates = report["fates"]
+    assert fates["frames"] == fates["kept"] + fates["still"] + fates["resampled"], fates
+    assert fates["kept"] == len(result) and fates["still"] > 50 and fates["resampled"] > 10, fates
+    print(f"{len(recording)} frames at 30 Hz became {len(result)} at 20 Hz, each with the image of its row, backwards")
+
+
+def video(program, root):
+    """Frames of a video are those that LeRobot decodes, to what two decoders' colour conversions differ by."""
+    dataset, index, worst = open_dataset(root), 0, 0.0
+    for episode in frames(program, root):
+        for image in episode:
+            difference = np.abs(image.astype(int) - as_uint8(dataset[index]["observation.images.front"]).astype(int))
+            worst = max(worst, float(difference.mean()))
+            index += 1
+    assert index == len(dataset), (index, len(dataset))
+    # A frame off by one moves the square: measured 0.5 and more.
+    assert worst < 2.0, worst
+    print(f"same {index} video frames; mean absolute difference at most {worst:.2f} of 255")
+
+
+def frames(program, root):
+    """PNG files of a dataset's camera, as the Rust reader hands them out."""
+    from PIL import Image
+
+    folder = Path(root).parent / "frames-out"
+    subprocess.run([program, "images", root, folder], check=True)
+    for episode in sorted(folder.iterdir()):
+        yield [np.array(Image.open(p).convert("RGB")) for p in sorted(episode.iterdir())]
+
+
 def train(root):
     """LeRobot trains its diffusion policy on the dataset for a few steps: losses are finite, gradients reach every part."""
     from lerobot.configs.types import FeatureType
@@ -241,6 +300,7 @@ def train(root):
 
 COMMANDS = {
     "compare": compare, "statistics": statistics, "append": append, "windows": windows, "train": train,
+    "refined": refined, "video": video,
     "foreign": lambda root: foreign(root, False), "foreign-video": lambda root: foreign(root, True),
 }
 if __name__ == "__main__":

@@ -42,6 +42,33 @@ echo "== a dataset written by LeRobot"
 lerobot foreign "$work/theirs"
 lerobot compare "$programs/interop" "$work/theirs"
 "$programs/dataset" check "$work/theirs"
+
+echo "== another robot's recording becomes hard-direction data that LeRobot trains on"
+"$programs/refine" --dataset "$work/theirs" --out "$work/refined" --pose observation.tcp --rotation xyzw \
+    --gripper observation.jaw_mm --gripper-range 0,80 --state observation.state --task "plug it in"
+"$programs/dataset" check "$work/refined"
+lerobot compare "$programs/interop" "$work/refined"
+lerobot statistics "$work/refined"
+lerobot refined "$work/theirs" "$work/refined"
+lerobot train "$work/refined"
+
+echo "== we go on with a dataset of LeRobot's"
 "$programs/interop" append "$work/theirs"
 lerobot compare "$programs/interop" "$work/theirs"
-lerobot statistics "$work/theirs"
+"$programs/dataset" check "$work/theirs"
+
+echo "== a video dataset written by LeRobot"
+lerobot foreign-video "$work/video"
+echo "without a decoder:"
+! E2H_FFMPEG="$work/no-ffmpeg" "$programs/interop" dump "$work/video" > /dev/null 2> "$work/stderr"
+grep -h "no-ffmpeg" "$work/stderr" | head -n 1
+# LeRobot's packages bring a decoder of their own; any other does as well.
+export E2H_FFMPEG="${E2H_FFMPEG:-$(command -v ffmpeg || "$python" -c 'import imageio_ffmpeg as f; print(f.get_ffmpeg_exe())' 2> /dev/null || true)}"
+if [ -n "$E2H_FFMPEG" ]; then
+    lerobot video "$programs/interop" "$work/video"
+    "$programs/dataset" check "$work/video"
+else
+    echo "NOT RUN: no ffmpeg to decode the video with"
+fi
+
+echo "all interop checks hold"

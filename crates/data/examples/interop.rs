@@ -4,6 +4,7 @@
 //! cargo run --release -p e2h-data --example interop -- write DIR
 //! cargo run --release -p e2h-data --example interop -- append DIR
 //! cargo run --release -p e2h-data --example interop -- dump DIR
+//! cargo run --release -p e2h-data --example interop -- images DIR OUT
 //! ```
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
@@ -18,7 +19,14 @@ const ROWS: [usize; 5] = [130, 7, 1, 12, 30];
 
 fn main() -> Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [command, dir] = &arguments[..] else { bail!("usage: interop write|append|dump DIR") };
+    if let [command, dir, out] = &arguments[..]
+        && command == "images"
+    {
+        return images(dir, out);
+    }
+    let [command, dir] = &arguments[..] else {
+        bail!("usage: interop write|append|dump DIR, or images DIR OUT")
+    };
     match command.as_str() {
         "write" => write(dir),
         "append" => append(dir),
@@ -97,6 +105,20 @@ fn dump(dir: &str) -> Result<()> {
         let line =
             json!({"episode": i, "rows": table.rows, "tasks": dataset.row_tasks(i)?, "columns": columns});
         println!("{line}");
+    }
+    Ok(())
+}
+
+/// The first camera's frames as files, a folder an episode.
+fn images(dir: &str, out: &str) -> Result<()> {
+    let dataset = Dataset::open(dir)?;
+    let camera = dataset.info().features.iter().find(|(_, f)| f.is_visual()).context("a camera")?.0.clone();
+    for i in 0..dataset.len() {
+        let folder = std::path::Path::new(out).join(format!("{i:03}"));
+        std::fs::create_dir_all(&folder)?;
+        for (t, file) in dataset.read_columns(i, &[&camera])?.png(&camera)?.iter().enumerate() {
+            std::fs::write(folder.join(format!("{t:05}.png")), file)?;
+        }
     }
     Ok(())
 }

@@ -33,8 +33,12 @@ pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<()> {
     sync(path.parent().unwrap_or(Path::new(".")))
 }
 
-/// Writes or replaces a file.
-pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+/// Writes or replaces a file, and makes its folder where it is not there. At any instant the old file or the new one is
+/// there, whole.
+///
+/// # Errors
+/// When the file system refuses; the file is then what it was.
+pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let folder = path.parent().unwrap_or(Path::new("."));
     make_folder(folder)?;
     let mut file = unfinished(folder)?;

@@ -38,6 +38,7 @@ mod sample;
 mod store;
 mod window;
 
+pub use atomic::write as write_atomic;
 pub use crop::Crop;
 pub use error::{Error, Result};
 pub use normalise::{Normaliser, NormaliserConfig};

@@ -16,6 +16,7 @@ mod episodes;
 mod feature;
 mod parquet_file;
 mod picture;
+mod robot;
 mod stats;
 mod table;
 mod tasks;
@@ -31,6 +32,7 @@ pub use episode::{
 pub use episodes::{EpisodeSpan, VideoSpan};
 pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Info, VERSION};
 pub use picture::encode as encode_png;
+pub use robot::{ColumnSlice, RobotColumns, Rotation};
 pub use stats::{FeatureStats, QUANTILES, Stats};
 pub use table::{Column, Table};
 pub use writer::Writer;

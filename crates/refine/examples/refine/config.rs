@@ -4,7 +4,7 @@ use anyhow::{Context, Result, bail};
 use e2h_core::nearest;
 use e2h_refine::{GateConfig, KinematicConfig, ReverseConfig};
 use serde::{Deserialize, Serialize};
-use toml::{Table, Value};
+use serde_json::{Map, Value};
 
 /// Everything that `--set` can change.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -27,17 +27,18 @@ impl Config {
             gate: GateConfig { enabled: false, ..GateConfig::default() },
             reference_given: false,
         };
-        let mut table = Table::try_from(&default)?;
+        let mut table = serde_json::to_value(&default)?;
         for text in set {
             let (key, value) =
                 text.split_once('=').with_context(|| format!("--set: expected key=value, got `{text}`"))?;
-            let value =
-                format!("v = {value}").parse::<Table>().ok().and_then(|mut t| t.remove("v")).with_context(
-                    || format!("--set {key}: expected a number, true, false or a list, got `{value}`"),
-                )?;
-            replace(&mut table, key.trim(), value)?;
+            let value: Value = serde_json::from_str(value).ok().with_context(|| {
+                format!("--set {key}: expected a number, true, false or a list, got `{value}`")
+            })?;
+            *slot(&mut table, key.trim(), &value)? = value.clone();
+            // One at a time, so that a value of the wrong kind is named with its key.
+            serde_json::from_value::<Self>(table.clone()).with_context(|| format!("--set {key}"))?;
         }
-        let mut config: Self = Value::Table(table).try_into().context("--set")?;
+        let mut config: Self = serde_json::from_value(table)?;
         config.reference_given =
             set.iter().any(|s| s.trim_start().starts_with("reverse.reference_quaternion"));
         let mut problems = config.reverse.validate();
@@ -50,23 +51,24 @@ impl Config {
     }
 }
 
-fn replace(table: &mut Table, key: &str, value: Value) -> Result<()> {
+/// The entry that `key` names.
+fn slot<'a>(table: &'a mut Value, key: &str, value: &Value) -> Result<&'a mut Value> {
     let (group, name) = key.split_once('.').unwrap_or((key, ""));
-    let names = |t: &Table| t.keys().cloned().collect::<Vec<_>>();
-    let unknown = |known: Vec<String>, word: &str, prefix: &str| {
-        let near = nearest(word, known.iter().map(String::as_str)).unwrap_or_default().to_owned();
+    let unknown = |known: &Map<String, Value>, word: &str, prefix: &str| {
+        let near = nearest(word, known.keys().map(String::as_str)).unwrap_or_default().to_owned();
         anyhow::anyhow!("--set: unknown key `{key}`; did you mean `{prefix}{near}`?")
     };
-    let groups = names(table);
-    let Some(Value::Table(entries)) = table.get_mut(group) else { return Err(unknown(groups, group, "")) };
-    let known = names(entries);
-    let Some(slot) = entries.get_mut(name) else { return Err(unknown(known, name, &format!("{group}."))) };
-    *slot = match (&slot, value) {
-        (Value::Float(_), Value::Integer(i)) => Value::Float(i as f64),
-        (old, new) if old.type_str() == new.type_str() => new,
-        (old, new) => {
-            bail!("--set {key}: expected a value of type {}, got {new} ({})", old.type_str(), new.type_str())
-        }
-    };
-    Ok(())
+    let groups = table.as_object_mut().context("the configuration is a table")?;
+    if !groups.contains_key(group) {
+        return Err(unknown(groups, group, ""));
+    }
+    let entries = groups.get_mut(group).and_then(Value::as_object_mut).context("a group is a table")?;
+    if !entries.contains_key(name) {
+        return Err(unknown(entries, name, &format!("{group}.")));
+    }
+    let old = entries.get_mut(name).context("the entry is there")?;
+    if std::mem::discriminant(&*old) != std::mem::discriminant(value) {
+        bail!("--set {key}: expected a value like {old}, got {value}");
+    }
+    Ok(old)
 }

@@ -253,7 +253,7 @@ pub(crate) fn html(
         s.fates.frames,
         accounts.iter().map(episode).collect::<String>(),
         pictures.concat(),
-        escape(&toml::to_string(config)?)
+        escape(&serde_json::to_string_pretty(config)?)
     ))
 }
 

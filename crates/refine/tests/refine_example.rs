@@ -38,10 +38,16 @@ fn record(root: &Path, successes: &[bool]) {
         let n = rows.len();
         let columns = vec![
             // Orientation: half a turn about x, written with the real part last.
-            ("tcp".to_owned(), Column::F32(rows.iter().flat_map(|r| [r.0, 0.0, r.1, 1.0, 0.0, 0.0, 0.0]).collect())),
+            (
+                "tcp".to_owned(),
+                Column::F32(rows.iter().flat_map(|r| [r.0, 0.0, r.1, 1.0, 0.0, 0.0, 0.0]).collect()),
+            ),
             ("jaw".to_owned(), Column::F32(rows.iter().flat_map(|r| [-1.0, r.2]).collect())),
             ("joints".to_owned(), Column::F64((0..3 * n).map(|i| i as f64).collect())),
-            ("front".to_owned(), Column::Png((0..n).map(|t| encode_png(4, 6, &[t as u8; 72]).unwrap()).collect())),
+            (
+                "front".to_owned(),
+                Column::Png((0..n).map(|t| encode_png(4, 6, &[t as u8; 72]).unwrap()).collect()),
+            ),
             ("next.success".to_owned(), Column::Bool((0..n).map(|t| success && t + 1 == n).collect())),
         ];
         writer.push(&Table { rows: n, columns }, "unplug").unwrap();
@@ -93,7 +99,11 @@ fn a_recording_becomes_hard_direction_data() {
 
     let table = dataset.read(0).unwrap();
     let frames = table.i64("source.frame").unwrap();
-    assert_eq!((frames[0], *frames.last().unwrap()), (198, 0), "the first row at 20 Hz nearest to the last at 30 Hz");
+    assert_eq!(
+        (frames[0], *frames.last().unwrap()),
+        (198, 0),
+        "the first row at 20 Hz nearest to the last at 30 Hz"
+    );
     assert!(frames.windows(2).all(|w| w[1] < w[0]), "backwards");
     let states: Vec<&[f32]> = table.f32("observation.state").unwrap().chunks_exact(10).collect();
     let actions: Vec<&[f32]> = table.f32("action").unwrap().chunks_exact(8).collect();

@@ -507,7 +507,7 @@ fn truncated_files_are_refused_at_every_length() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(256))]
+    #![proptest_config(ProptestConfig::with_cases(128))]
     #[test]
     fn damaged_files_never_stop_a_reader(
         file in 0..FILES.len(), near_end: bool, changes in prop::collection::vec((any::<u16>(), any::<u8>()), 1..6),

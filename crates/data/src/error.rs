@@ -79,6 +79,26 @@ pub enum Error {
         /// Side of the crop.
         size: usize,
     },
+    /// A table does not fit the features of its dataset.
+    #[error("column `{column}`: expected {expected}, found {found}")]
+    Column {
+        /// Name of the column.
+        column: String,
+        /// What the feature asks for.
+        expected: String,
+        /// What the table holds.
+        found: String,
+    },
+    /// Videos cannot be read here.
+    #[error("{}: expected {needs}, found {found}", path.display())]
+    Video {
+        /// The video file.
+        path: PathBuf,
+        /// What reading it takes.
+        needs: &'static str,
+        /// What there is.
+        found: String,
+    },
     /// There is nothing to draw from.
     #[error("sampler: expected windows in at least one set, found none")]
     NoWindows,

@@ -26,16 +26,19 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod atomic;
 mod crop;
 mod error;
 mod file;
 #[cfg(test)]
 mod fixture;
+pub mod lerobot;
 mod normalise;
 mod sample;
 mod store;
 mod window;
 
+pub use atomic::write as write_atomic;
 pub use crop::Crop;
 pub use error::{Error, Result};
 pub use normalise::{Normaliser, NormaliserConfig};

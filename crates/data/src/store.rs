@@ -1,3 +1,4 @@
+use crate::atomic::{io, persist, unfinished};
 use crate::file::{WHOLE, decode, encode, file_error, header};
 use crate::{Error, Result};
 use e2h_core::{Episode, Origin, Outcome};
@@ -60,11 +61,7 @@ impl EpisodeStore {
     /// When the episode contradicts itself or the file system refuses; the file of that name is then what it was.
     pub fn write(&self, name: &str, episode: &Episode) -> Result<()> {
         let path = self.path(name)?;
-        self.stage(name, episode)?.persist(&path).map_err(|e| io("replace", &path)(e.error))?;
-        // The rename itself is safe only once the folder is.
-        #[cfg(unix)]
-        File::open(&self.folder).and_then(|f| f.sync_all()).map_err(io("sync the folder", &self.folder))?;
-        Ok(())
+        persist(self.stage(name, episode)?, &path)
     }
 
     /// The whole new file under a temporary name, synced.
@@ -72,12 +69,7 @@ impl EpisodeStore {
         let path = self.path(name)?;
         episode.validate().map_err(|source| Error::Episode { name: name.to_owned(), source })?;
         let bytes = encode(episode, &path)?;
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".new-");
-        // Temporary files are private by default; an episode is as readable as any file of its user.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644));
-        let mut file = builder.tempfile_in(&self.folder).map_err(io("write in", &self.folder))?;
+        let mut file = unfinished(&self.folder)?;
         file.write_all(&bytes).and_then(|()| file.as_file().sync_all()).map_err(io("write", &path))?;
         Ok(file)
     }
@@ -148,11 +140,6 @@ impl EpisodeStore {
             cameras: found.header.cameras,
         })
     }
-}
-
-fn io(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -> Error {
-    let path = path.to_owned();
-    move |source| Error::Io { action, path: path.clone(), source }
 }
 
 #[cfg(test)]

@@ -36,6 +36,12 @@ pub enum Error {
         /// The number.
         found: f32,
     },
+    /// A rate is not positive.
+    #[error("expected a positive rate, Hz, got {found}")]
+    Rate {
+        /// The rate.
+        found: f64,
+    },
     /// A later stage must account for exactly the frames that the stage before kept.
     #[error("expected fates for the {expected} frame(s) that the stage before kept, got {found}")]
     Fates {

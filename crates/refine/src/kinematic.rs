@@ -5,7 +5,7 @@ use crate::reverse::goals;
 use crate::smooth::smooth;
 use crate::still::still_runs;
 use crate::{Fate, Refined, ReverseConfig};
-use e2h_core::{Episode, Pose};
+use e2h_core::{CONTROL_HZ, Episode, Pose};
 use serde::{Deserialize, Serialize};
 
 /// What the kinematic filter cuts and re-times. Speeds are those of the tool centre point at 20 Hz.
@@ -81,6 +81,29 @@ impl KinematicConfig {
             object_drift: 0.0,
             resample_rotation: 0.0,
             ..Self::default()
+        }
+    }
+
+    /// The same thresholds for episodes at `hz` rows a second. The entries of this struct are meant at [`CONTROL_HZ`], at
+    /// which the filter counts; at another rate frames and metres a frame stand for other times and speeds.
+    #[must_use]
+    pub fn at_rate(&self, hz: f64) -> Self {
+        let longer = CONTROL_HZ / hz;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small and not negative")]
+        let frames = |n: usize| (n as f64 / longer).round() as usize;
+        Self {
+            static_speed: self.static_speed * longer,
+            slow_speed: self.slow_speed * longer,
+            rotation_speed: self.rotation_speed * longer,
+            gripper_motion: self.gripper_motion * longer,
+            resample_step: self.resample_step * longer,
+            resample_rotation: self.resample_rotation * longer,
+            static_frames: frames(self.static_frames),
+            protect_frames: frames(self.protect_frames),
+            slow_min_frames: frames(self.slow_min_frames),
+            speed_window: frames(self.speed_window),
+            smooth_frames: frames(self.smooth_frames),
+            ..self.clone()
         }
     }
 

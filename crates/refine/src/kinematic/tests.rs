@@ -161,3 +161,18 @@ fn configuration_reads_and_refuses() {
     assert_eq!(bad.validate().len(), 2);
     assert!(KinematicConfig::literal().validate().is_empty());
 }
+
+#[test]
+fn thresholds_hold_at_another_rate() {
+    // The same motion, seen twice as often: a pause of one second, a slow stretch, ordinary motion.
+    let seen =
+        |k: usize| along(&walk(&[(10 * k, 0.01 / k as f64), (20 * k, 0.0), (20 * k, 0.0025 / k as f64)]));
+    let (once, twice) = (seen(1), seen(2));
+    let at_20 = filter(&once, &KinematicConfig::default()).report;
+    let at_40 = filter(&twice, &KinematicConfig::default().at_rate(40.0)).report;
+    assert!(at_20.still > 10 && at_20.resampled > 5, "{at_20:?}");
+    for (a, b) in [(at_20.still, at_40.still), (at_20.resampled, at_40.resampled), (at_20.kept, at_40.kept)] {
+        assert!((2 * a).abs_diff(b) <= 3, "{at_20:?} {at_40:?}");
+    }
+    assert_eq!(KinematicConfig::default().at_rate(20.0), KinematicConfig::default());
+}

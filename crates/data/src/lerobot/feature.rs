@@ -1,0 +1,437 @@
+//! What a dataset says of itself: `meta/info.json`.
+
+use crate::file::file_error;
+use crate::{Error, Result};
+use serde::de::{Error as _, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::{Map, Value};
+use std::path::{Component, Path, PathBuf};
+
+/// Version of the layout that is read and written.
+pub const VERSION: &str = "v3.0";
+/// Files in a folder, before the next folder begins.
+const FILES_A_CHUNK: usize = 1000;
+/// Numbers that one row of one feature may hold: 256 Mi, far above any camera, far below any memory.
+const LARGEST: usize = 1 << 28;
+
+/// Type of the numbers of a feature.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Dtype {
+    /// 32-bit float.
+    Float32,
+    /// 64-bit float.
+    Float64,
+    /// 8-bit integer.
+    Int8,
+    /// 16-bit integer.
+    Int16,
+    /// 32-bit integer.
+    Int32,
+    /// 64-bit integer.
+    Int64,
+    /// 8-bit integer without sign.
+    UInt8,
+    /// 16-bit integer without sign.
+    UInt16,
+    /// 32-bit integer without sign.
+    UInt32,
+    /// True or false.
+    Bool,
+    /// Text.
+    String,
+    /// A PNG file in a Parquet column.
+    Image,
+    /// A stretch of an MP4 file beside the Parquet files.
+    Video,
+}
+
+/// One feature of a dataset: type, shape and names of its entries.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Feature {
+    /// Type of the numbers.
+    pub dtype: Dtype,
+    /// Shape of one row: `[1]` is a plain number, `[height, width, 3]` an image.
+    pub shape: Vec<usize>,
+    /// Names of the entries: a list, null, or what else a recorder put there.
+    pub names: Value,
+    /// What else `info.json` says of it; kept as it is.
+    #[serde(flatten)]
+    pub more: Map<String, Value>,
+}
+
+impl Feature {
+    /// A plain number.
+    #[must_use]
+    pub fn scalar(dtype: Dtype) -> Self {
+        Self { dtype, shape: vec![1], names: Value::Null, more: Map::new() }
+    }
+
+    /// A vector of 32-bit floats with named entries.
+    #[must_use]
+    pub fn vector<S: AsRef<str>>(names: &[S]) -> Self {
+        let names: Vec<&str> = names.iter().map(AsRef::as_ref).collect();
+        Self { dtype: Dtype::Float32, shape: vec![names.len()], names: names.into(), more: Map::new() }
+    }
+
+    /// An RGB image stored as PNG.
+    #[must_use]
+    pub fn image(height: usize, width: usize) -> Self {
+        let names = Value::from(vec!["height", "width", "channels"]);
+        Self { dtype: Dtype::Image, shape: vec![height, width, 3], names, more: Map::new() }
+    }
+
+    /// Numbers in one row.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// True for images, in Parquet or in videos.
+    #[must_use]
+    pub fn is_visual(&self) -> bool {
+        matches!(self.dtype, Dtype::Image | Dtype::Video)
+    }
+
+    /// Names of the entries, where they are a plain list of text.
+    #[must_use]
+    pub fn entry_names(&self) -> Option<Vec<&str>> {
+        self.names.as_array()?.iter().map(Value::as_str).collect()
+    }
+
+    pub(crate) fn describe(&self) -> String {
+        format!("{:?} {:?}", self.dtype, self.shape).to_lowercase()
+    }
+}
+
+/// Features in the order of `info.json`, which is the order of columns.
+pub type Features = Vec<(String, Feature)>;
+
+/// The columns that every dataset has. `timestamp` is in seconds since the episode began, `index` counts over all episodes.
+pub const DEFAULT_FEATURES: [(&str, Dtype); 5] = [
+    ("timestamp", Dtype::Float32),
+    ("frame_index", Dtype::Int64),
+    ("episode_index", Dtype::Int64),
+    ("index", Dtype::Int64),
+    ("task_index", Dtype::Int64),
+];
+
+pub(crate) fn is_default(name: &str) -> bool {
+    DEFAULT_FEATURES.iter().any(|(n, _)| *n == name)
+}
+
+/// The contents of `meta/info.json`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Info {
+    /// Version of the layout.
+    pub codebase_version: String,
+    /// What recorded it.
+    #[serde(default)]
+    pub robot_type: Option<String>,
+    /// Episodes.
+    pub total_episodes: usize,
+    /// Rows of all episodes.
+    pub total_frames: usize,
+    /// Different tasks.
+    pub total_tasks: usize,
+    /// Files in a folder.
+    #[serde(default = "files_a_chunk")]
+    pub chunks_size: usize,
+    /// A data file that reaches this size is closed; MiB.
+    #[serde(default = "data_file_size")]
+    pub data_files_size_in_mb: usize,
+    /// The same for videos; MiB.
+    #[serde(default = "video_file_size")]
+    pub video_files_size_in_mb: usize,
+    /// Rows a second, Hz.
+    #[serde(serialize_with = "write_fps")]
+    pub fps: f64,
+    /// Named ranges of episodes.
+    #[serde(default)]
+    pub splits: Map<String, Value>,
+    /// Where data files are, below the root.
+    pub data_path: String,
+    /// Where videos are, below the root; none without videos.
+    #[serde(default)]
+    pub video_path: Option<String>,
+    /// All features, those of [`DEFAULT_FEATURES`] included.
+    #[serde(with = "in_order")]
+    pub features: Features,
+    /// What else the file says; kept as it is.
+    #[serde(flatten)]
+    pub more: Map<String, Value>,
+}
+
+fn files_a_chunk() -> usize {
+    FILES_A_CHUNK
+}
+
+fn data_file_size() -> usize {
+    100
+}
+
+fn video_file_size() -> usize {
+    200
+}
+
+/// LeRobot writes whole rates as integers and compares them as such.
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks for a reference")]
+fn write_fps<S: Serializer>(fps: &f64, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole and below 2^32")]
+    if fps.fract() == 0.0 && (0.0..4e9).contains(fps) {
+        serializer.serialize_u64(*fps as u64)
+    } else {
+        serializer.serialize_f64(*fps)
+    }
+}
+
+mod in_order {
+    use super::*;
+
+    pub(super) fn serialize<S: Serializer>(
+        features: &Features,
+        s: S,
+    ) -> std::result::Result<S::Ok, S::Error> {
+        s.collect_map(features.iter().map(|(name, feature)| (name, feature)))
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(d: D) -> std::result::Result<Features, D::Error> {
+        struct InOrder;
+        impl<'de> Visitor<'de> for InOrder {
+            type Value = Features;
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("a map of features")
+            }
+            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Features, A::Error> {
+                let mut features: Features = vec![];
+                while let Some(name) = map.next_key::<String>()? {
+                    let feature: Feature =
+                        map.next_value().map_err(|e| A::Error::custom(format!("feature `{name}`: {e}")))?;
+                    if features.iter().any(|(n, _)| *n == name) {
+                        return Err(A::Error::custom(format!("feature `{name}` stands there twice")));
+                    }
+                    features.push((name, feature));
+                }
+                Ok(features)
+            }
+        }
+        d.deserialize_map(InOrder)
+    }
+}
+
+impl Info {
+    /// What a new dataset says of itself. `features` are those beside [`DEFAULT_FEATURES`].
+    ///
+    /// # Errors
+    /// Names the first feature that cannot be.
+    pub fn new(fps: f64, robot_type: Option<&str>, features: Features) -> Result<Self> {
+        let defaults = DEFAULT_FEATURES.iter().map(|(n, dtype)| ((*n).to_owned(), Feature::scalar(*dtype)));
+        let info = Self {
+            codebase_version: VERSION.to_owned(),
+            robot_type: robot_type.map(str::to_owned),
+            total_episodes: 0,
+            total_frames: 0,
+            total_tasks: 0,
+            chunks_size: FILES_A_CHUNK,
+            data_files_size_in_mb: data_file_size(),
+            video_files_size_in_mb: video_file_size(),
+            fps,
+            splits: Map::new(),
+            data_path: "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet".to_owned(),
+            video_path: None,
+            features: features.into_iter().chain(defaults).collect(),
+            more: Map::new(),
+        };
+        match info.problem() {
+            None => Ok(info),
+            Some((column, expected, found)) => Err(Error::Column { column, expected, found }),
+        }
+    }
+
+    /// Reads and checks the file's text.
+    pub(crate) fn parse(text: &[u8], path: &Path) -> Result<Self> {
+        // The version first: other versions have other keys.
+        #[derive(Deserialize)]
+        struct Version {
+            codebase_version: String,
+        }
+        let json = |e: serde_json::Error| file_error(path, "JSON", "a LeRobot info.json", e.to_string());
+        let Version { codebase_version: version } = serde_json::from_slice(text).map_err(json)?;
+        if version != VERSION {
+            return Err(file_error(path, "codebase_version", VERSION, version));
+        }
+        let info: Self = serde_json::from_slice(text).map_err(json)?;
+        if let Some((what, expected, found)) = info.problem() {
+            return Err(file_error(path, &what, expected, found));
+        }
+        for (name, dtype) in DEFAULT_FEATURES {
+            let feature = info.feature(name).map(Feature::describe);
+            let expected = Feature::scalar(dtype).describe();
+            if feature.as_deref() != Some(expected.as_str()) {
+                let found = feature.unwrap_or_else(|| "none".to_owned());
+                return Err(file_error(path, &format!("feature `{name}`"), expected, found));
+            }
+        }
+        info.data_file(0, 0).map_err(|found| file_error(path, "data_path", INSIDE, found))?;
+        if info.video_path.is_some() {
+            info.video_file("camera", 0, 0).map_err(|found| file_error(path, "video_path", INSIDE, found))?;
+        }
+        Ok(info)
+    }
+
+    /// The feature of that name.
+    #[must_use]
+    pub fn feature(&self, name: &str) -> Option<&Feature> {
+        self.features.iter().find(|(n, _)| n == name).map(|(_, f)| f)
+    }
+
+    /// The features beside [`DEFAULT_FEATURES`].
+    #[must_use]
+    pub fn own_features(&self) -> Features {
+        self.features.iter().filter(|(n, _)| !is_default(n)).cloned().collect()
+    }
+
+    /// The first contradiction: what, expected, found.
+    fn problem(&self) -> Option<(String, String, String)> {
+        let bad =
+            |what: &str, expected: &str, found: String| Some((what.to_owned(), expected.to_owned(), found));
+        if !(self.fps.is_finite() && self.fps > 0.0) {
+            return bad("fps", "a positive rate, Hz", self.fps.to_string());
+        }
+        if self.chunks_size == 0 {
+            return bad("chunks_size", "at least 1", "0".to_owned());
+        }
+        for (i, (name, feature)) in self.features.iter().enumerate() {
+            let what = format!("feature `{name}`");
+            if name.is_empty() || name.contains(['/', '\\', '\0']) || name == ".." || name == "." {
+                return bad(&what, "a name without `/`", format!("{name:?}"));
+            }
+            if self.features[..i].iter().any(|(n, _)| n == name) {
+                return bad(&what, "each name once", "it twice".to_owned());
+            }
+            let size = feature.shape.iter().try_fold(1_usize, |a, &b| a.checked_mul(b));
+            let deep = feature.shape.len() > 5;
+            if feature.shape.is_empty() || deep || size.is_none_or(|n| n == 0 || n > LARGEST) {
+                return bad(&what, "a shape of 1 to 5 sizes, none 0", format!("{:?}", feature.shape));
+            }
+            let image = matches!(feature.shape[..], [h, w, 3] if h < 1 << 16 && w < 1 << 16);
+            if feature.is_visual() && !image {
+                return bad(&what, "an image of shape [height, width, 3]", format!("{:?}", feature.shape));
+            }
+            if feature.dtype == Dtype::String && feature.shape != [1] {
+                return bad(&what, "shape [1] for text", format!("{:?}", feature.shape));
+            }
+            if feature.dtype == Dtype::Video && self.video_path.is_none() {
+                return bad(&what, "a video_path, since there are videos", "null".to_owned());
+            }
+        }
+        None
+    }
+
+    /// A data file, below the root.
+    pub(crate) fn data_file(&self, chunk: usize, file: usize) -> std::result::Result<PathBuf, String> {
+        expand(&self.data_path, None, chunk, file)
+    }
+
+    /// A video file, below the root.
+    pub(crate) fn video_file(
+        &self,
+        key: &str,
+        chunk: usize,
+        file: usize,
+    ) -> std::result::Result<PathBuf, String> {
+        expand(self.video_path.as_deref().unwrap_or_default(), Some(key), chunk, file)
+    }
+
+    /// The place after the one given: (folder, file).
+    pub(crate) fn next_file(&self, (chunk, file): (usize, usize)) -> (usize, usize) {
+        if file + 1 >= self.chunks_size { (chunk + 1, 0) } else { (chunk, file + 1) }
+    }
+}
+
+/// What a path template must lead to.
+pub(crate) const INSIDE: &str = "a path inside the dataset made of {chunk_index:03d} and {file_index:03d}";
+
+/// A path template with its numbers filled in; refused where it leaves the dataset.
+fn expand(
+    template: &str,
+    key: Option<&str>,
+    chunk: usize,
+    file: usize,
+) -> std::result::Result<PathBuf, String> {
+    let filled = template
+        .replace("{chunk_index:03d}", &format!("{chunk:03}"))
+        .replace("{file_index:03d}", &format!("{file:03}"));
+    let numbers = template.contains("{chunk_index:03d}") && template.contains("{file_index:03d}");
+    let filled = match key {
+        Some(key) => filled.replace("{video_key}", key),
+        None => filled,
+    };
+    let path = PathBuf::from(&filled);
+    let inside = path.components().all(|c| matches!(c, Component::Normal(_)));
+    if inside && numbers && !filled.contains(['{', '}', '\\']) { Ok(path) } else { Err(template.to_owned()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn info() -> Info {
+        let features = vec![("z".to_owned(), Feature::vector(&["a", "b"]))];
+        Info::new(20.0, Some("arm"), features).unwrap()
+    }
+
+    fn refusal(change: impl FnOnce(&mut Value)) -> String {
+        let mut value = serde_json::to_value(info()).unwrap();
+        change(&mut value);
+        Info::parse(value.to_string().as_bytes(), Path::new("info.json")).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn the_order_of_features_and_unknown_keys_survive() {
+        let mut info = info();
+        info.more.insert("total_videos".to_owned(), 3.into());
+        info.features[0].1.more.insert("fps".to_owned(), 30.into());
+        let text = serde_json::to_vec(&info).unwrap();
+        assert_eq!(Info::parse(&text, Path::new("x")).unwrap(), info);
+        let text = String::from_utf8(text).unwrap();
+        assert!(text.contains("\"fps\":20,") && text.contains("\"total_videos\":3"), "{text}");
+        assert!(text.find("\"z\"").unwrap() < text.find("\"timestamp\"").unwrap());
+    }
+
+    #[test]
+    fn what_cannot_be_is_named() {
+        let other = refusal(|v| v["codebase_version"] = "v2.1".into());
+        assert!(other.contains("codebase_version: expected v3.0, found v2.1"), "{other}");
+        assert!(refusal(|v| v["fps"] = 0.into()).contains("fps: expected a positive rate"));
+        assert!(refusal(|v| v["features"]["z"]["shape"] = Value::from(vec![0])).contains("feature `z`"));
+        let huge = Value::from(vec![usize::MAX, 2]);
+        assert!(refusal(|v| v["features"]["z"]["shape"] = huge).contains("feature `z`"));
+        assert!(refusal(|v| v["features"]["z"]["dtype"] = "complex".into()).contains("feature `z`"));
+        assert!(refusal(|v| v["features"]["index"]["dtype"] = "bool".into()).contains("int64 [1]"));
+        assert!(refusal(|v| v["features"]["z"]["dtype"] = "video".into()).contains("[height, width, 3]"));
+        assert!(refusal(|v| *v = Value::Null).contains("JSON"));
+    }
+
+    #[test]
+    fn paths_stay_in_the_dataset() {
+        for path in
+            ["/etc/{chunk_index:03d}{file_index:03d}", "../{chunk_index:03d}/{file_index:03d}", "data/x"]
+        {
+            assert!(refusal(|v| v["data_path"] = path.into()).contains("data_path"), "{path}");
+        }
+        assert_eq!(info().data_file(1, 22).unwrap(), Path::new("data/chunk-001/file-022.parquet"));
+        for name in ["a/b", "..", ""] {
+            let features = vec![(name.to_owned(), Feature::scalar(Dtype::Bool))];
+            assert!(matches!(Info::new(20.0, None, features), Err(Error::Column { .. })), "{name}");
+        }
+        let twice = vec![("timestamp".to_owned(), Feature::scalar(Dtype::Float32))];
+        assert!(Info::new(20.0, None, twice).is_err());
+    }
+
+    #[test]
+    fn files_are_counted_as_lerobot_counts_them() {
+        assert_eq!(info().next_file((0, 998)), (0, 999));
+        assert_eq!(info().next_file((0, 999)), (1, 0));
+    }
+}

@@ -1,0 +1,124 @@
+//! Images as PNG files, which is how they lie in Parquet columns.
+
+use crate::Result;
+use crate::file::file_error;
+use std::path::Path;
+
+/// An RGB image, 8 bits a channel, as a PNG file.
+///
+/// # Shapes
+/// `data` (height, width, 3).
+///
+/// # Errors
+/// When the bytes do not fill the image.
+pub fn encode(height: usize, width: usize, data: &[u8]) -> Result<Vec<u8>> {
+    let bad =
+        |found: String| super::table::column_error("image", format!("{height} x {width} x 3 bytes"), found);
+    let side = |n: usize| u32::try_from(n).map_err(|e| bad(e.to_string()));
+    if data.len() != height * width * 3 {
+        return Err(bad(format!("{} bytes", data.len())));
+    }
+    let mut bytes = vec![];
+    let mut encoder = png::Encoder::new(&mut bytes, side(width)?, side(height)?);
+    encoder.set_color(png::ColorType::Rgb);
+    encoder.set_depth(png::BitDepth::Eight);
+    // Frames are written once a step while recording: a tenth more bytes for a fraction of the time.
+    encoder.set_compression(png::Compression::Fast);
+    let mut writer = encoder.write_header().map_err(|e| bad(e.to_string()))?;
+    writer.write_image_data(data).map_err(|e| bad(e.to_string()))?;
+    writer.finish().map_err(|e| bad(e.to_string()))?;
+    Ok(bytes)
+}
+
+/// The pixels of a PNG file of known size. Grey becomes RGB, transparency is dropped, 16 bits become 8.
+///
+/// # Shapes
+/// The result is (height, width, 3).
+///
+/// # Errors
+/// When it is no PNG file or of another size; `path` and `what` say where it lay.
+pub(crate) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
+    let bad = |found: String| file_error(path, what, format!("a PNG image of {height} x {width}"), found);
+    let broken = |e: png::DecodingError| bad(e.to_string());
+    let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));
+    decoder.set_transformations(png::Transformations::normalize_to_color8());
+    let header = decoder.read_header_info().map_err(broken)?;
+    // The size before any pixel: a file of a few bytes may promise gigabytes.
+    if (header.height as usize, header.width as usize) != (height, width) {
+        return Err(bad(format!("{} x {}", header.height, header.width)));
+    }
+    let mut reader = decoder.read_info().map_err(broken)?;
+    let size = reader.output_buffer_size().ok_or_else(|| bad("more pixels than memory".to_owned()))?;
+    let mut data = vec![0; size];
+    let frame = reader.next_frame(&mut data).map_err(broken)?;
+    data.truncate(frame.buffer_size());
+    let rgb: Vec<u8> = match frame.color_type {
+        png::ColorType::Rgb => data,
+        png::ColorType::Rgba => data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect(),
+        png::ColorType::Grayscale => data.iter().flat_map(|&p| [p; 3]).collect(),
+        png::ColorType::GrayscaleAlpha => data.chunks_exact(2).flat_map(|p| [p[0]; 3]).collect(),
+        png::ColorType::Indexed => return Err(bad("a palette that was not applied".to_owned())),
+    };
+    if rgb.len() == height * width * 3 { Ok(rgb) } else { Err(bad(format!("{} bytes of pixels", rgb.len()))) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn from(bytes: &[u8], height: usize, width: usize) -> Result<Vec<u8>> {
+        decode(bytes, height, width, Path::new("x"), "row 0")
+    }
+
+    #[test]
+    fn pixels_survive_and_sizes_are_checked() {
+        let data: Vec<u8> = (0..4 * 6 * 3).map(|i| (i * 37) as u8).collect();
+        let png = encode(4, 6, &data).unwrap();
+        assert_eq!(from(&png, 4, 6).unwrap(), data);
+        let message = from(&png, 6, 4).unwrap_err().to_string();
+        assert_eq!(message, "x: row 0: expected a PNG image of 6 x 4, found 4 x 6");
+        assert!(encode(4, 6, &data[1..]).is_err());
+        assert!(from(b"\xff\xd8\xff\xe0 JFIF", 4, 6).is_err());
+    }
+
+    #[test]
+    fn other_kinds_of_png_become_rgb() {
+        for (kind, depth, data) in [
+            (png::ColorType::Grayscale, png::BitDepth::Eight, vec![7, 9]),
+            (png::ColorType::GrayscaleAlpha, png::BitDepth::Eight, vec![7, 0, 9, 255]),
+            (png::ColorType::Rgba, png::BitDepth::Eight, vec![7, 7, 7, 1, 9, 9, 9, 2]),
+            (png::ColorType::Grayscale, png::BitDepth::Sixteen, vec![7, 200, 9, 10]),
+        ] {
+            let mut bytes = vec![];
+            let mut encoder = png::Encoder::new(&mut bytes, 2, 1);
+            encoder.set_color(kind);
+            encoder.set_depth(depth);
+            let mut writer = encoder.write_header().unwrap();
+            writer.write_image_data(&data).unwrap();
+            writer.finish().unwrap();
+            assert_eq!(from(&bytes, 1, 2).unwrap(), [7, 7, 7, 9, 9, 9], "{kind:?} {depth:?}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_promises_too_much_is_refused_before_its_pixels() {
+        let mut png = encode(1, 1, &[1, 2, 3]).unwrap();
+        png[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);
+        assert!(from(&png, 1, 1).is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn damaged_files_are_errors_or_images(at in 0_usize..200, value: u8, keep in 0_usize..200) {
+            let data: Vec<u8> = (0..5 * 5 * 3).map(|i| (i * 91) as u8).collect();
+            let mut png = encode(5, 5, &data).unwrap();
+            let at = at % png.len();
+            png[at] = value;
+            png.truncate(keep.max(1));
+            if let Ok(found) = from(&png, 5, 5) {
+                prop_assert_eq!(found.len(), 75);
+            }
+        }
+    }
+}

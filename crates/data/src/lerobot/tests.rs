@@ -1,0 +1,534 @@
+use super::*;
+use crate::atomic::fuse;
+use crate::fixture::episode;
+use e2h_core::{Direction, Episode, Kind, Outcome};
+use proptest::prelude::*;
+use std::path::{Path, PathBuf};
+
+fn place() -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("set");
+    (folder, root)
+}
+
+/// An episode that differs from others in every column.
+fn numbered(n: usize) -> Episode {
+    let mut e = episode(3 + n);
+    e.origin.episode = n as u32;
+    e.state[0][0] = -(n as f32);
+    e.frames[0].data[0] = n as u8;
+    e
+}
+
+fn written(root: &Path, episodes: usize) -> Writer {
+    let mut writer = Writer::create(root, 20.0, Some("arm"), features_of(&numbered(0))).unwrap();
+    for n in 0..episodes {
+        writer.push_episode(&numbered(n)).unwrap();
+    }
+    writer
+}
+
+/// The dataset holds exactly the first `count` numbered episodes.
+fn assert_holds(root: &Path, count: usize) {
+    let dataset = Dataset::open(root).unwrap();
+    assert_eq!(dataset.len(), count);
+    for n in 0..count {
+        assert_eq!(dataset.read_episode(n).unwrap(), numbered(n));
+    }
+}
+
+#[test]
+fn a_generic_table_comes_back_column_by_column() {
+    let (_folder, root) = place();
+    let own = vec![
+        ("text".to_owned(), Feature::scalar(Dtype::String)),
+        ("matrix".to_owned(), Feature { shape: vec![2, 3], ..Feature::scalar(Dtype::Float64) }),
+        ("small".to_owned(), Feature { shape: vec![2], ..Feature::scalar(Dtype::Int8) }),
+        ("byte".to_owned(), Feature::scalar(Dtype::UInt8)),
+        ("camera".to_owned(), Feature::image(2, 3)),
+    ];
+    let png = |v: u8| encode_png(2, 3, &[v; 18]).unwrap();
+    let table = Table {
+        rows: 2,
+        columns: vec![
+            ("text".to_owned(), Column::Text(vec!["a".to_owned(), String::new()])),
+            ("matrix".to_owned(), Column::F64((0..12).map(f64::from).collect())),
+            ("small".to_owned(), Column::I64(vec![-128, 127, 0, 1])),
+            ("byte".to_owned(), Column::I64(vec![255, 0])),
+            ("camera".to_owned(), Column::Png(vec![png(1), png(2)])),
+        ],
+    };
+    let mut writer = Writer::create(&root, 30.0, None, own).unwrap();
+    writer.push(&table, "first").unwrap();
+    writer.push(&table, "second").unwrap();
+    writer.finish().unwrap();
+    let dataset = Dataset::open(&root).unwrap();
+    let read = dataset.read(1).unwrap();
+    for (name, column) in &table.columns {
+        assert_eq!(read.column(name), Some(column), "{name}");
+    }
+    assert_eq!(read.f32("timestamp").unwrap(), [0.0, 1.0_f32 / 30.0]);
+    assert_eq!(read.i64("index").unwrap(), [2, 3]);
+    assert_eq!(read.i64("frame_index").unwrap(), [0, 1]);
+    assert_eq!(dataset.row_tasks(1).unwrap(), ["second", "second"]);
+    assert_eq!(dataset.episodes()[1].tasks, ["second"]);
+    let one = dataset.read_columns(0, &["byte"]).unwrap();
+    assert_eq!(one.columns, [("byte".to_owned(), Column::I64(vec![255, 0]))]);
+    assert!(dataset.read_columns(0, &["bite"]).unwrap_err().to_string().contains("bite"));
+    assert!(dataset.read(2).is_err());
+}
+
+#[test]
+fn many_commits_read_as_one_dataset() {
+    let (_folder, root) = place();
+    let mut writer = written(&root, 2);
+    writer.commit().unwrap();
+    writer.push_episode(&numbered(2)).unwrap();
+    writer.finish().unwrap();
+    let mut writer = Writer::append(&root).unwrap();
+    writer.push_episode(&numbered(3)).unwrap();
+    let info = writer.finish().unwrap();
+    assert_eq!((info.total_episodes, info.total_frames, info.total_tasks), (4, 18, 1));
+    assert_eq!(info.splits["train"], "0:4");
+    assert_holds(&root, 4);
+
+    // The statistics are those of all rows at once.
+    let (_folder, other) = place();
+    written(&other, 4).finish().unwrap();
+    let stats = |root: &Path| -> serde_json::Value {
+        serde_json::from_slice(&std::fs::read(root.join("meta/stats.json")).unwrap()).unwrap()
+    };
+    assert_eq!(stats(&root)["observation.state"], stats(&other)["observation.state"]);
+    assert_eq!(stats(&root)["index"]["max"][0], 17);
+    assert_eq!(stats(&root)["observation.images.wrist"]["count"][0], 18);
+    assert_eq!(stats(&root)["next.success"]["max"][0], true);
+}
+
+#[test]
+fn a_full_file_is_committed_by_itself() {
+    let (_folder, root) = place();
+    let mut writer = written(&root, 0);
+    writer.commit().unwrap();
+    let mut e = numbered(0);
+    // Noise does not compress: this is more than a file's worth of it.
+    let side = 700;
+    e.frames.truncate(1);
+    (e.frames[0].height, e.frames[0].width) = (side, side);
+    let mut x = 1_u32;
+    let mut noise = || {
+        x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (x >> 24) as u8
+    };
+    e.frames[0].data = (0..e.len() * side * side * 3).map(|_| noise()).collect();
+    let mut writer = Writer::create(root.with_extension("big"), 20.0, None, features_of(&e)).unwrap();
+    for _ in 0..25 {
+        writer.push_episode(&e).unwrap();
+    }
+    let first = Dataset::open(root.with_extension("big")).unwrap();
+    assert!((20..25).contains(&first.len()), "{}", first.len());
+    writer.finish().unwrap();
+    let dataset = Dataset::open(root.with_extension("big")).unwrap();
+    assert_eq!(dataset.len(), 25);
+    assert_eq!(dataset.episodes()[24].file, (0, 1));
+    assert_eq!(dataset.read_episode(24).unwrap(), e);
+}
+
+#[test]
+fn a_writer_killed_between_any_two_files_leaves_whole_episodes() {
+    // Five files a commit: rows, places, tasks, statistics, info.
+    for killed_after in 0..5 {
+        let (_folder, root) = place();
+        let mut writer = written(&root, 2);
+        fuse::set(Some(killed_after));
+        writer.commit().unwrap_err();
+        fuse::set(None);
+        drop(writer);
+        assert!(Dataset::open(&root).is_err(), "nothing yet");
+
+        written(&root, 2).finish().unwrap();
+        let mut writer = Writer::append(&root).unwrap();
+        writer.push_episode(&numbered(2)).unwrap();
+        fuse::set(Some(killed_after));
+        writer.commit().unwrap_err();
+        fuse::set(None);
+        drop(writer);
+        assert_holds(&root, 2);
+
+        // Whoever goes on ends with the same dataset as without the kill.
+        let mut writer = Writer::append(&root).unwrap();
+        writer.push_episode(&numbered(2)).unwrap();
+        writer.finish().unwrap();
+        assert_holds(&root, 3);
+        let (_folder, other) = place();
+        written(&other, 2).finish().unwrap();
+        let mut writer = Writer::append(&other).unwrap();
+        writer.push_episode(&numbered(2)).unwrap();
+        writer.finish().unwrap();
+        for file in
+            ["meta/stats.json", "meta/info.json", "meta/tasks.parquet", "data/chunk-000/file-001.parquet"]
+        {
+            let bytes = |root: &Path| std::fs::read(root.join(file)).unwrap();
+            assert!(bytes(&root) == bytes(&other), "{file} after {killed_after}");
+        }
+    }
+}
+
+#[test]
+fn unfinished_files_are_no_part_of_a_dataset_and_are_cleared_away() {
+    let (_folder, root) = place();
+    written(&root, 2).finish().unwrap();
+    let left = root.join("data/chunk-000/.new-abc");
+    std::fs::write(&left, b"half").unwrap();
+    assert_holds(&root, 2);
+    drop(Writer::append(&root).unwrap());
+    assert!(!left.exists());
+}
+
+#[test]
+fn what_does_not_fit_is_refused_by_name() {
+    let (_folder, root) = place();
+    let mut writer = written(&root, 1);
+    let good = to_table(&numbered(1), &[]).unwrap();
+    let message = |writer: &mut Writer, change: &dyn Fn(&mut Table)| {
+        let mut table = good.clone();
+        change(&mut table);
+        writer.push(&table, "t").unwrap_err().to_string()
+    };
+    let action = |t: &Table| t.columns.iter().position(|(n, _)| n == "action").unwrap();
+    let short = message(&mut writer, &|t| drop(t.columns.remove(action(t))));
+    assert_eq!(short, "column `action`: expected float32 [8], found none");
+    let nan = message(&mut writer, &|t| {
+        let i = action(t);
+        if let Column::F32(v) = &mut t.columns[i].1 {
+            v[11] = f32::NAN;
+        }
+    });
+    assert!(nan.contains("column `action`") && nan.contains("row 1, entry 3"), "{nan}");
+    let other = message(&mut writer, &|t| {
+        let i = action(t);
+        t.columns[i].1 = Column::Bool(vec![true; 32]);
+    });
+    assert!(other.contains("found bool"), "{other}");
+    let more = message(&mut writer, &|t| t.columns.push(("x".into(), Column::Bool(vec![]))));
+    assert!(more.contains("`x`"), "{more}");
+    let empty = message(&mut writer, &|t| t.rows = 0);
+    assert!(empty.contains("at least one row"), "{empty}");
+    let image = message(&mut writer, &|t| {
+        if let Column::Png(v) = &mut t.columns[1].1 {
+            v[2] = b"jpeg".to_vec();
+        }
+    });
+    assert!(image.contains("observation.images.wrist") && image.contains("row 2"), "{image}");
+    // The writer goes on after each of them.
+    writer.push_episode(&numbered(1)).unwrap();
+    writer.finish().unwrap();
+    assert_holds(&root, 2);
+    assert!(Writer::create(&root, 20.0, None, vec![]).unwrap_err().to_string().contains("info.json"));
+}
+
+#[test]
+fn fates_and_tables_of_others() {
+    let e = numbered(2);
+    let table = to_table(&e, &[0, 2, 0, 1, 0]).unwrap();
+    let (back, fates) = from_table(&table, &features_of(&e), "test").unwrap();
+    assert_eq!((back, fates), (e.clone(), vec![0, 2, 0, 1, 0]));
+    let mut other = table.clone();
+    other.columns.retain(|(n, _)| n != "source.seed");
+    let message = from_table(&other, &features_of(&e), "test").unwrap_err().to_string();
+    assert!(message.contains("source.seed"), "{message}");
+    let mut other = table;
+    for (name, column) in &mut other.columns {
+        if name == "source.outcome" {
+            *column = Column::I64(vec![9; 5]);
+        }
+    }
+    let message = from_table(&other, &features_of(&e), "test").unwrap_err().to_string();
+    assert_eq!(message, "column `source.outcome`: expected below 4, found 9");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn episodes_survive_with_all_their_provenance(
+        numbers in prop::collection::vec(-1e30_f32..1e30, 1..12), terminal: bool, reversed: bool, seed: u64,
+        task in ".{0,12}", kind in 0_usize..3, outcome in 0_usize..4, iteration: u32, cameras: bool,
+    ) {
+        let (_folder, root) = place();
+        let mut e = episode(numbers.len());
+        for (t, v) in numbers.iter().enumerate() {
+            (e.state[t][14], e.action[t][0], e.source[t]) = (*v, -v, u32::MAX - t as u32);
+        }
+        if !cameras {
+            e.frames.clear();
+        }
+        e.terminal = terminal;
+        e.outcome = [Outcome::Success { at: 7 }, Outcome::Timeout, Outcome::Dropped, Outcome::Diverged][outcome];
+        e.origin.kind = [Kind::Demonstration, Kind::Rollout, Kind::Refined][kind];
+        e.origin.direction = if reversed { Direction::Hard } else { Direction::Easy };
+        (e.origin.reversed, e.origin.seed, e.origin.iteration, e.origin.task) = (reversed, seed, iteration, task);
+        let mut writer = Writer::create(&root, 20.0, None, features_of(&e)).unwrap();
+        writer.push_episode(&e).unwrap();
+        writer.finish().unwrap();
+        prop_assert_eq!(Dataset::open(&root).unwrap().read_episode(0).unwrap(), e);
+    }
+}
+
+fn faults(root: &Path) -> Vec<String> {
+    check(root).unwrap().faults.into_iter().map(|f| f.message).collect()
+}
+
+/// Five episodes in three data files: 0 and 1, 2 and 3, 4.
+fn three_files(root: &Path) {
+    let mut writer = written(root, 2);
+    for n in 2..5 {
+        if n != 3 {
+            writer.commit().unwrap();
+        }
+        writer.push_episode(&numbered(n)).unwrap();
+    }
+    writer.finish().unwrap();
+}
+
+fn data_file(root: &Path, n: usize) -> PathBuf {
+    root.join(format!("data/chunk-000/file-{n:03}.parquet"))
+}
+
+#[test]
+fn a_sound_dataset_has_no_faults() {
+    let (_folder, root) = place();
+    three_files(&root);
+    let report = check(&root).unwrap();
+    assert_eq!(report.faults, []);
+    assert_eq!((report.episodes, report.frames, report.whole), (5, 25, 5));
+    assert_eq!((report.verified_files, report.unverified_files), (6, 0));
+    assert_eq!(repair(&root).unwrap().repairs, Vec::<String>::new());
+}
+
+#[test]
+fn one_changed_byte_is_found_and_what_precedes_it_is_kept() {
+    let (_folder, root) = place();
+    three_files(&root);
+    let file = data_file(&root, 1);
+    let mut bytes = std::fs::read(&file).unwrap();
+    // In the second half of the data, that is in episode 3.
+    let metadata = u32::from_le_bytes(bytes[bytes.len() - 8..bytes.len() - 4].try_into().unwrap()) as usize;
+    let at = bytes.len() - 8 - metadata - 1500;
+    bytes[at] ^= 1;
+    std::fs::write(&file, &bytes).unwrap();
+    let report = check(&root).unwrap();
+    let first = &report.faults[0];
+    assert!(first.message.contains("file-001.parquet: rows 5 to 10: expected the checksum"), "{first:?}");
+    assert_eq!((first.episode, report.whole, first.repairable), (Some(3), 3, true));
+
+    let report = repair(&root).unwrap();
+    assert_eq!(report.faults, []);
+    assert!(report.repairs[0].contains("kept the first 3 of 5 episodes"), "{:?}", report.repairs);
+    assert_holds(&root, 3);
+    // What was cut off is still there, and the dataset can go on.
+    assert_eq!(std::fs::read(root.join("removed/data/chunk-000/file-001.parquet")).unwrap(), bytes);
+    let mut writer = Writer::append(&root).unwrap();
+    writer.push_episode(&numbered(3)).unwrap();
+    writer.finish().unwrap();
+    assert_holds(&root, 4);
+    assert!(check(&root).unwrap().is_sound());
+}
+
+#[test]
+fn a_truncated_or_missing_file_costs_its_episodes() {
+    for missing in [true, false] {
+        let (_folder, root) = place();
+        three_files(&root);
+        let file = data_file(&root, 2);
+        if missing {
+            std::fs::remove_file(&file).unwrap();
+        } else {
+            let bytes = std::fs::read(&file).unwrap();
+            std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
+        }
+        assert!(faults(&root)[0].contains("file-002.parquet"));
+        let report = repair(&root).unwrap();
+        assert_eq!((report.faults.len(), report.whole), (0, 4), "{report:?}");
+        assert_holds(&root, 4);
+    }
+}
+
+#[test]
+fn a_list_that_was_never_finished_costs_its_episodes() {
+    // What LeRobot's recorder leaves when it is killed: counts that are ahead of the files.
+    let (_folder, root) = place();
+    three_files(&root);
+    for file in ["meta/episodes/chunk-000/file-002.parquet", "data/chunk-000/file-002.parquet"] {
+        std::fs::write(root.join(file), b"PAR1 half").unwrap();
+    }
+    let report = check(&root).unwrap();
+    assert_eq!((report.whole, report.faults[0].episode), (4, Some(4)));
+    assert!(Dataset::open(&root).is_err());
+    assert_eq!(repair(&root).unwrap().faults, []);
+    assert_holds(&root, 4);
+}
+
+#[test]
+fn a_commit_that_was_cut_off_is_cleared_away() {
+    for killed_after in 1..5 {
+        let (_folder, root) = place();
+        three_files(&root);
+        let mut writer = Writer::append(&root).unwrap();
+        writer.push_episode(&numbered(5)).unwrap();
+        fuse::set(Some(killed_after));
+        writer.commit().unwrap_err();
+        fuse::set(None);
+        let found = faults(&root);
+        assert!(found[0].contains("nothing counts") || killed_after > 3, "{found:?}");
+        let report = repair(&root).unwrap();
+        assert_eq!((report.faults, report.whole), (vec![], 5));
+        assert!(!data_file(&root, 3).exists());
+        assert_holds(&root, 5);
+    }
+}
+
+#[test]
+fn a_repair_that_was_killed_can_be_run_again() {
+    for killed_after in 0..4 {
+        let (_folder, root) = place();
+        three_files(&root);
+        std::fs::write(data_file(&root, 2), b"").unwrap();
+        let last = data_file(&root, 1);
+        let mut bytes = std::fs::read(&last).unwrap();
+        bytes[6000] ^= 0xff;
+        std::fs::write(&last, bytes).unwrap();
+        let whole = check(&root).unwrap().whole;
+        fuse::set(Some(killed_after));
+        let _ = repair(&root);
+        fuse::set(None);
+        let report = repair(&root).unwrap();
+        assert_eq!(report.faults, [], "killed after {killed_after}");
+        assert_holds(&root, whole);
+    }
+}
+
+#[test]
+fn wrong_numbers_beside_the_rows_are_found() {
+    let edit = |root: &Path, file: &str, from: &str, to: &str| {
+        let path = root.join(file);
+        let text = std::fs::read_to_string(&path).unwrap();
+        assert!(text.contains(from), "{text}");
+        std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
+    };
+    let (_folder, root) = place();
+    three_files(&root);
+    edit(&root, "meta/stats.json", "\"count\": [\n            25", "\"count\": [\n            26");
+    assert!(faults(&root)[0].contains("count: expected [25], found [26]"), "{:?}", faults(&root));
+    assert!(repair(&root).unwrap().is_sound());
+    edit(&root, "meta/info.json", "\"total_frames\": 25", "\"total_frames\": 26");
+    assert!(Dataset::open(&root).unwrap_err().to_string().contains("total_frames: expected 25, found 26"));
+    assert!(repair(&root).unwrap().is_sound());
+    edit(&root, "meta/info.json", "\"total_episodes\": 5", "\"total_episodes\": 7");
+    assert!(faults(&root)[0].contains("expected 7 episodes, found 5"), "{:?}", faults(&root));
+    assert!(repair(&root).unwrap().is_sound());
+    assert_holds(&root, 5);
+    edit(&root, "meta/info.json", "\"fps\": 20", "\"fps\": 25");
+    let found = faults(&root);
+    assert!(found[0].contains("column `timestamp`, row 1: expected 0.04, found 0.05"), "{found:?}");
+    edit(&root, "meta/info.json", "v3.0", "v2.1");
+    assert!(faults(&root)[0].contains("expected v3.0, found v2.1"));
+    assert!(repair(&root).unwrap().repairs.is_empty(), "what cannot be repaired is left alone");
+}
+
+#[test]
+fn a_foreign_column_type_is_named_with_its_column() {
+    let (_folder, root) = place();
+    written(&root, 1).finish().unwrap();
+    let text = std::fs::read_to_string(root.join("meta/info.json")).unwrap();
+    let text = text.replacen("\"dtype\": \"image\"", "\"dtype\": \"video\"", 1);
+    std::fs::write(root.join("meta/info.json"), text).unwrap();
+    let message = Dataset::open(&root).unwrap_err().to_string();
+    assert!(message.contains("video_path"), "{message}");
+
+    let (_folder, root) = place();
+    written(&root, 1).finish().unwrap();
+    let text = std::fs::read_to_string(root.join("meta/info.json")).unwrap();
+    let wrong = text.replacen("\"dtype\": \"bool\"", "\"dtype\": \"string\"", 1);
+    std::fs::write(root.join("meta/info.json"), wrong).unwrap();
+    let message = Dataset::open(&root).unwrap().read(0).unwrap_err().to_string();
+    assert!(message.contains("column `next.success`: expected string [1], found Boolean"), "{message}");
+    let at = text.find("\"action\"").unwrap();
+    let wrong = text[..at].to_owned() + &text[at..].replacen("8\n", "9\n", 1);
+    std::fs::write(root.join("meta/info.json"), wrong).unwrap();
+    let message = Dataset::open(&root).unwrap().read(0).unwrap_err().to_string();
+    assert!(message.contains("column `action`, row 0: expected 9 entries, found 8"), "{message}");
+}
+
+/// A dataset with damage in one of its files, and what all readers say of it: errors, but no panic and no hang.
+fn survive(file: &str, damage: impl Fn(&mut Vec<u8>)) -> bool {
+    thread_local! { static WHOLE: (tempfile::TempDir, PathBuf) = {
+        let (folder, root) = place();
+        written(&root, 2).finish().unwrap();
+        (folder, root)
+    }; }
+    WHOLE.with(|(_folder, whole)| {
+        let path = whole.join(file);
+        let good = std::fs::read(&path).unwrap();
+        let mut bad = good.clone();
+        damage(&mut bad);
+        std::fs::write(&path, &bad).unwrap();
+        if let Ok(dataset) = Dataset::open(whole) {
+            for i in 0..dataset.len() {
+                let _ = dataset.read(i);
+                let _ = dataset.read_episode(i);
+            }
+        }
+        let noticed = check(whole).map_or(true, |r| !r.is_sound());
+        let _ = Writer::append(whole);
+        std::fs::write(&path, good).unwrap();
+        noticed
+    })
+}
+
+const FILES: [&str; 5] = [
+    "data/chunk-000/file-000.parquet",
+    "meta/episodes/chunk-000/file-000.parquet",
+    "meta/tasks.parquet",
+    "meta/info.json",
+    "meta/stats.json",
+];
+
+#[test]
+fn truncated_files_are_refused_at_every_length() {
+    for file in FILES {
+        let length = {
+            let (_folder, root) = place();
+            written(&root, 2).finish().unwrap();
+            std::fs::metadata(root.join(file)).unwrap().len() as usize
+        };
+        for keep in (0..length).step_by(length / 40 + 1).chain([length - 1]) {
+            assert!(survive(file, |b| b.truncate(keep)), "{file} of {keep} bytes");
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(128))]
+    #[test]
+    fn damaged_files_never_stop_a_reader(
+        file in 0..FILES.len(), near_end: bool, changes in prop::collection::vec((any::<u16>(), any::<u8>()), 1..6),
+    ) {
+        survive(FILES[file], |bytes| {
+            for &(at, value) in &changes {
+                // Footers steer the decoder, so half of the damage is done there.
+                let span = if near_end { bytes.len().min(3000) } else { bytes.len() };
+                let at = bytes.len() - 1 - usize::from(at) % span;
+                bytes[at] = value;
+            }
+        });
+    }
+
+    #[test]
+    fn changed_rows_are_always_noticed(at in any::<u32>(), bit in 0_u8..8) {
+        let noticed = survive(FILES[0], |bytes| {
+            let metadata = u32::from_le_bytes(*bytes[..bytes.len() - 4].last_chunk().unwrap()) as usize;
+            let at = at as usize % (bytes.len() - 8 - metadata);
+            bytes[at] ^= 1_u8 << bit;
+        });
+        prop_assert!(noticed);
+    }
+}

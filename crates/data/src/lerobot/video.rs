@@ -1,0 +1,67 @@
+//! Frames of videos, decoded by the machine's `ffmpeg`. This project links no decoder.
+
+use super::feature::Feature;
+use super::picture;
+use crate::file::file_error;
+use crate::{Error, Result};
+use std::io::{Read, Seek};
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+/// Names the decoder when it is not called `ffmpeg` or not on the path.
+const PROGRAM: &str = "E2H_FFMPEG";
+
+/// `count` frames from `from` seconds on, as PNG files.
+pub(crate) fn read(
+    path: &Path,
+    from: f64,
+    count: usize,
+    fps: f64,
+    feature: &Feature,
+) -> Result<Vec<Vec<u8>>> {
+    let [height, width, _] = feature.shape[..] else { return Ok(vec![]) };
+    if !path.is_file() {
+        return Err(file_error(path, "video", "a file", "none"));
+    }
+    // Half a frame early, so that rounding of times does not skip the first frame.
+    let start = (from - 0.5 / fps).max(0.0);
+    let program = std::env::var_os(PROGRAM).unwrap_or_else(|| "ffmpeg".into());
+    let mut command = Command::new(&program);
+    command.args(["-v", "error", "-nostdin", "-ss", &format!("{start:.6}"), "-i"]).arg(path);
+    command.args(["-frames:v", &count.to_string(), "-fps_mode", "passthrough"]);
+    command.args(["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]);
+    let failed = |found: String| Error::Video {
+        path: path.to_owned(),
+        needs: "the program `ffmpeg` (or the one that E2H_FFMPEG names) to decode it",
+        found,
+    };
+    // To a file: a pipe that nobody reads would fill up and stop the decoder.
+    let mut said = tempfile::tempfile().map_err(|e| failed(e.to_string()))?;
+    let stderr = said.try_clone().map_err(|e| failed(e.to_string()))?;
+    let mut child = command
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(stderr)
+        .spawn()
+        .map_err(|e| failed(format!("{}: {e}", program.to_string_lossy())))?;
+    let mut frames = Vec::with_capacity(count);
+    let mut frame = vec![0; height * width * 3];
+    if let Some(mut out) = child.stdout.take() {
+        while frames.len() < count && out.read_exact(&mut frame).is_ok() {
+            frames.push(picture::encode(height, width, &frame)?);
+        }
+    }
+    let status = child.wait().map_err(|e| failed(e.to_string()))?;
+    if frames.len() == count {
+        return Ok(frames);
+    }
+    let mut text = vec![];
+    let _ = said.rewind().and_then(|()| said.take(1000).read_to_end(&mut text));
+    let found = format!("{} ({status} {})", frames.len(), String::from_utf8_lossy(&text).trim());
+    Err(file_error(
+        path,
+        &format!("video from {from} s"),
+        format!("{count} frames of {height} x {width}"),
+        found,
+    ))
+}

@@ -1,0 +1,74 @@
+#!/usr/bin/env bash
+# Do LeRobot and this project open, compare and extend each other's datasets? Opt-in: it needs Python 3.10 to 3.12 and some
+# gigabytes of packages, which go into a virtual environment of its own (E2H_INTEROP_ENV, by default below target/).
+# Exit status: 0 everything holds, 1 something does not, 3 the packages could not be installed and nothing was run.
+set -euo pipefail
+here="$(cd "$(dirname "$0")" && pwd)"
+root="$(cd "$here/../.." && pwd)"
+environment="${E2H_INTEROP_ENV:-$root/target/interop/environment}"
+python="$environment/bin/python"
+
+if ! "$python" -c 'import lerobot' 2> /dev/null; then
+    echo "installing LeRobot into $environment"
+    if ! { python3 -m venv "$environment" && "$python" -m pip install --quiet -r "$here/requirements.txt"; }; then
+        echo "NOT RUN: the packages of tests/interop/requirements.txt could not be installed"
+        exit 3
+    fi
+fi
+
+cd "$root"
+cargo build --release --quiet --example interop --example dataset --example refine
+programs="${CARGO_TARGET_DIR:-$root/target}/release/examples"
+work="$(mktemp -d)"
+trap 'rm -rf "$work"' EXIT
+export HF_HUB_OFFLINE=1 HF_HOME="$work/hf" CUDA_VISIBLE_DEVICES="" TOKENIZERS_PARALLELISM=false
+
+lerobot() { "$python" -W ignore "$here/interop.py" "$@" 2> "$work/stderr" || { cat "$work/stderr"; exit 1; }; }
+
+echo "== a dataset written here"
+"$programs/interop" write "$work/ours"
+lerobot compare "$programs/interop" "$work/ours"
+lerobot statistics "$work/ours"
+lerobot windows "$work/ours"
+"$programs/dataset" check "$work/ours"
+
+echo "== LeRobot goes on with it, then we do"
+lerobot append "$work/ours"
+"$programs/interop" append "$work/ours"
+lerobot compare "$programs/interop" "$work/ours"
+"$programs/dataset" check "$work/ours"
+
+echo "== a dataset written by LeRobot"
+lerobot foreign "$work/theirs"
+lerobot compare "$programs/interop" "$work/theirs"
+"$programs/dataset" check "$work/theirs"
+
+echo "== another robot's recording becomes hard-direction data that LeRobot trains on"
+"$programs/refine" --dataset "$work/theirs" --out "$work/refined" --pose observation.tcp --rotation xyzw \
+    --gripper observation.jaw_mm --gripper-range 0,80 --state observation.state --task "plug it in"
+"$programs/dataset" check "$work/refined"
+lerobot compare "$programs/interop" "$work/refined"
+lerobot statistics "$work/refined"
+lerobot refined "$work/theirs" "$work/refined"
+lerobot train "$work/refined"
+
+echo "== we go on with a dataset of LeRobot's"
+"$programs/interop" append "$work/theirs"
+lerobot compare "$programs/interop" "$work/theirs"
+"$programs/dataset" check "$work/theirs"
+
+echo "== a video dataset written by LeRobot"
+lerobot foreign-video "$work/video"
+echo "without a decoder:"
+! E2H_FFMPEG="$work/no-ffmpeg" "$programs/interop" dump "$work/video" > /dev/null 2> "$work/stderr"
+grep -h "no-ffmpeg" "$work/stderr" | head -n 1
+# LeRobot's packages bring a decoder of their own; any other does as well.
+export E2H_FFMPEG="${E2H_FFMPEG:-$(command -v ffmpeg || "$python" -c 'import imageio_ffmpeg as f; print(f.get_ffmpeg_exe())' 2> /dev/null || true)}"
+if [ -n "$E2H_FFMPEG" ]; then
+    lerobot video "$programs/interop" "$work/video"
+    "$programs/dataset" check "$work/video"
+else
+    echo "NOT RUN: no ffmpeg to decode the video with"
+fi
+
+echo "all interop checks hold"

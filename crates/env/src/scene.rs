@@ -15,6 +15,13 @@ pub struct TableCamera {
     pub fovy: f64,
 }
 
+impl Default for TableCamera {
+    /// From the far side of the table, over the middle of what the arm reaches.
+    fn default() -> Self {
+        Self { position: [1.02, 0.26, 0.50], target: [0.54, -0.01, 0.05], fovy: 32.0 }
+    }
+}
+
 /// The robot's scene (MJCF) with the bodies of a task (`bodies`, MJCF elements of the world body), the fixed camera
 /// `table` and the camera `wrist` on the hand.
 #[must_use]

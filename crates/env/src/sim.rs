@@ -1,6 +1,7 @@
-use crate::{Error, Result, arm::Arm, arm::JOINTS};
+use crate::arm::{Arm, JOINTS, PosturePull};
+use crate::{Error, Result};
 use e2h_core::Pose;
-use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
+use mujoco_rs::prelude::{MjData, MjModel, MjtJoint, MjtObjBase, MjtState, MjtWarning};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::sync::Arc;
 
@@ -37,34 +38,25 @@ pub struct Sim {
     home: Command,
     tcp: usize,
     object: usize,
-    object_qpos: usize,
-    object_dof: usize,
     robot_geoms: Vec<bool>,
     object_geoms: Vec<bool>,
 }
 
 impl Sim {
     /// A scene with the arm at the posture that holds the tool centre point at `home`.
-    pub(crate) fn new(model: Arc<MjModel>, object: &str, home: &Pose) -> Result<Self> {
+    pub(crate) fn new(model: Arc<MjModel>, object: &str, home: &Pose, pull: PosturePull) -> Result<Self> {
         let find = |kind, what, name: &str| {
             model.name_to_id(kind, name).ok_or_else(|| Error::Missing { what, name: name.to_owned() })
         };
         let tcp = find(MjtObjBase::mjOBJ_SITE, "site", "tcp")?;
         let body = find(MjtObjBase::mjOBJ_BODY, "body", object)?;
         let hand = find(MjtObjBase::mjOBJ_BODY, "body", "hand")?;
-        let joint = model
-            .body_jntadr()
-            .get(body)
-            .and_then(|&j| usize::try_from(j).ok())
-            .ok_or(Error::Missing { what: "free joint of the object", name: object.to_owned() })?;
-        let address = |all: &[i32]| all.get(joint).and_then(|&a| usize::try_from(a).ok()).unwrap_or(0);
-        let (object_qpos, object_dof) = (address(model.jnt_qposadr()), address(model.jnt_dofadr()));
         let on = |body: usize| model.geom_bodyid().iter().map(|&b| b == body as i32).collect::<Vec<_>>();
         let robot_geoms =
             model.geom_bodyid().iter().map(|&b| (hand as i32..=hand as i32 + 2).contains(&b)).collect();
         let object_geoms = on(body);
 
-        let mut arm = Arm::new(&model, tcp);
+        let mut arm = Arm::new(&model, tcp, pull);
         let (joints, error) = arm.solve(home, &arm.posture(), 200);
         if error > 1e-4 {
             return Err(Error::Unreachable { what: "home pose", error });
@@ -72,19 +64,8 @@ impl Sim {
         arm.set_posture(joints);
         let command = Command { goal: *home, joints, open: true };
         let data = MjData::new(model.clone());
-        let mut sim = Self {
-            data,
-            command,
-            arm,
-            home: command,
-            tcp,
-            object: body,
-            object_qpos,
-            object_dof,
-            robot_geoms,
-            object_geoms,
-            model,
-        };
+        let mut sim =
+            Self { data, command, arm, home: command, tcp, object: body, robot_geoms, object_geoms, model };
         sim.clear(&joints);
         Ok(sim)
     }
@@ -92,13 +73,10 @@ impl Sim {
     /// Puts everything at rest: the arm at `joints`, the gripper open, the object where the scene has it.
     pub(crate) fn clear(&mut self, joints: &[f64; JOINTS]) {
         self.data.reset();
-        let qpos = self.data.qpos_mut();
-        qpos[..JOINTS].copy_from_slice(joints);
-        qpos[GRIP..GRIP + 2].fill(FINGER_OPEN);
-        let ctrl = self.data.ctrl_mut();
-        ctrl[..JOINTS].copy_from_slice(joints);
-        ctrl[GRIP] = FINGER_OPEN;
-        self.command = Command { goal: self.arm.pose(joints), joints: *joints, open: true };
+        self.set_arm(joints);
+        self.data.qpos_mut()[GRIP..GRIP + 2].fill(FINGER_OPEN);
+        self.data.ctrl_mut()[GRIP] = FINGER_OPEN;
+        self.command.open = true;
         self.refresh();
     }
 
@@ -126,6 +104,12 @@ impl Sim {
         self.home.goal
     }
 
+    /// The gripper command that holds at the moment: true for open.
+    #[must_use]
+    pub fn opens(&self) -> bool {
+        self.command.open
+    }
+
     pub(crate) fn home_joints(&self) -> [f64; JOINTS] {
         self.home.joints
     }
@@ -133,16 +117,47 @@ impl Sim {
     /// Pose of the object.
     #[must_use]
     pub fn object(&self) -> Pose {
-        let (p, q) = (self.data.xpos()[self.object], self.data.xquat()[self.object]);
+        self.pose(self.object)
+    }
+
+    /// Pose of a body of the scene.
+    ///
+    /// # Errors
+    /// When there is no such body.
+    pub fn body(&self, name: &str) -> Result<Pose> {
+        Ok(self.pose(self.body_id(name)?))
+    }
+
+    /// Speed of the frame of a free body, m/s.
+    ///
+    /// # Errors
+    /// When there is no such body, or it is not free.
+    pub fn speed(&self, name: &str) -> Result<f64> {
+        let (_, dof) = self.free_joint(self.body_id(name)?)?;
+        Ok(Vector3::from_row_slice(&self.data.qvel()[dof..dof + 3]).norm())
+    }
+
+    fn pose(&self, body: usize) -> Pose {
+        let (p, q) = (self.data.xpos()[body], self.data.xquat()[body]);
         let q = Quaternion::new(q[0], q[1], q[2], q[3]);
         Pose::new(Vector3::from(p), UnitQuaternion::try_new(q, 1e-9).unwrap_or_else(UnitQuaternion::identity))
     }
 
-    /// Speed of the object's frame, m/s.
-    #[must_use]
-    pub fn object_speed(&self) -> f64 {
-        let v = &self.data.qvel()[self.object_dof..self.object_dof + 3];
-        Vector3::from_row_slice(v).norm()
+    fn body_id(&self, name: &str) -> Result<usize> {
+        self.model
+            .name_to_id(MjtObjBase::mjOBJ_BODY, name)
+            .ok_or_else(|| Error::Missing { what: "body", name: name.to_owned() })
+    }
+
+    /// Where positions and velocities of a free body begin.
+    fn free_joint(&self, body: usize) -> Result<(usize, usize)> {
+        let index = |v: Option<&i32>| v.and_then(|&v| usize::try_from(v).ok());
+        index(self.model.body_jntadr().get(body))
+            .filter(|&j| self.model.jnt_type().get(j) == Some(&MjtJoint::mjJNT_FREE))
+            .and_then(|j| {
+                Some((index(self.model.jnt_qposadr().get(j))?, index(self.model.jnt_dofadr().get(j))?))
+            })
+            .ok_or_else(|| Error::Missing { what: "free joint of body", name: body.to_string() })
     }
 
     /// Distance between the fingers, m, in [0, [`MAX_OPENING`]].
@@ -166,6 +181,12 @@ impl Sim {
         })
     }
 
+    /// Depth of the deepest contact, m.
+    #[must_use]
+    pub fn penetration(&self) -> f64 {
+        self.data.contact().iter().map(|c| -c.dist).fold(0.0, f64::max)
+    }
+
     /// Whether the gripper is open and clear of the object.
     #[must_use]
     pub fn released(&self) -> bool {
@@ -173,14 +194,53 @@ impl Sim {
     }
 
     /// Puts the object at rest at a pose.
-    pub fn set_object(&mut self, pose: &Pose) {
+    ///
+    /// # Errors
+    /// When the object is not a free body.
+    pub fn set_object(&mut self, pose: &Pose) -> Result<()> {
+        self.set(self.object, pose)
+    }
+
+    /// Puts a free body at rest at a pose.
+    ///
+    /// # Errors
+    /// When there is no such body, or it is not free.
+    pub fn set_body(&mut self, name: &str, pose: &Pose) -> Result<()> {
+        self.set(self.body_id(name)?, pose)
+    }
+
+    fn set(&mut self, body: usize, pose: &Pose) -> Result<()> {
+        let (qpos, dof) = self.free_joint(body)?;
         let q = pose.orientation.quaternion();
         let row = [pose.position.x, pose.position.y, pose.position.z, q.w, q.i, q.j, q.k];
-        let at = self.object_qpos;
-        self.data.qpos_mut()[at..at + 7].copy_from_slice(&row);
-        let at = self.object_dof;
-        self.data.qvel_mut()[at..at + 6].fill(0.0);
+        self.data.qpos_mut()[qpos..qpos + 7].copy_from_slice(&row);
+        self.data.qvel_mut()[dof..dof + 6].fill(0.0);
         self.refresh();
+        Ok(())
+    }
+
+    /// Puts the arm at rest with the tool centre point at a pose, and the object between its fingers at a pose; the
+    /// fingers close from `opening`, m.
+    ///
+    /// # Errors
+    /// When the arm cannot reach the pose, or the object is not a free body.
+    pub fn set_holding(&mut self, tcp: &Pose, object: &Pose, opening: f64) -> Result<()> {
+        let (joints, error) = self.arm.solve(tcp, &self.home.joints, 200);
+        if error > 1e-3 {
+            return Err(Error::Unreachable { what: "start pose of the hand", error });
+        }
+        self.set_arm(&joints);
+        self.data.qpos_mut()[GRIP..GRIP + 2].fill(0.5 * opening);
+        self.data.ctrl_mut()[GRIP] = FINGER_CLOSED;
+        self.command.open = false;
+        self.set_object(object)
+    }
+
+    fn set_arm(&mut self, joints: &[f64; JOINTS]) {
+        self.data.qpos_mut()[..JOINTS].copy_from_slice(joints);
+        self.data.ctrl_mut()[..JOINTS].copy_from_slice(joints);
+        self.command.goal = self.arm.pose(joints);
+        self.command.joints = *joints;
     }
 
     /// Lets the scene come to rest with the arm held where it is.

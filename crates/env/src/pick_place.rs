@@ -76,6 +76,8 @@ pub(crate) enum Turn {
     Hand(f64),
     /// Upright, its own yaw this, rad.
     Object(f64),
+    /// Just so.
+    To(UnitQuaternion<f64>),
 }
 
 impl Turn {
@@ -85,6 +87,7 @@ impl Turn {
             Self::Keep => upright(object),
             Self::Hand(yaw) => turn(yaw - yaw_of(&sim.tcp().orientation)) * upright(object),
             Self::Object(yaw) => turn(yaw - yaw_of(&object)) * upright(object),
+            Self::To(orientation) => orientation,
         }
     }
 }

@@ -251,7 +251,22 @@ impl Sim {
         }
     }
 
-    /// The same with the gripper open.
+    /// Waits until the object is at rest, for at most so many control steps: what leans or rocks takes a while.
+    ///
+    /// # Errors
+    /// When the object is not a free body.
+    pub fn settle_object(&mut self, most: usize) -> Result<()> {
+        let (_, dof) = self.free_joint(self.object)?;
+        for _ in 0..most {
+            self.settle(1);
+            if self.data.qvel()[dof..dof + 6].iter().all(|v| v.abs() < 1e-3) {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// As [`Self::settle`], with the gripper open.
     pub(crate) fn settle_open(&mut self, control_steps: usize) {
         self.command.open = true;
         self.settle(control_steps);

@@ -1,5 +1,6 @@
 //! The task pairs, one file and its scene each.
 
+mod brush;
 mod cube_pick_place;
 mod cube_stack;
 mod cylinder_pick_place;
@@ -10,6 +11,7 @@ mod rod_insertion;
 mod test_tube;
 
 use crate::task::Entry;
+pub use brush::Brush;
 pub use cube_pick_place::CubePickPlace;
 pub use cube_stack::CubeStack;
 pub use cylinder_pick_place::CylinderPickPlace;
@@ -20,7 +22,7 @@ pub use rod_insertion::RodInsertion;
 pub use test_tube::TestTube;
 
 /// Every pair, in the order in which they are listed.
-pub(crate) const ENTRIES: [&Entry; 8] = [
+pub(crate) const ENTRIES: [&Entry; 9] = [
     &cube_pick_place::ENTRY,
     &cylinder_pick_place::ENTRY,
     &cube_stack::ENTRY,
@@ -29,4 +31,5 @@ pub(crate) const ENTRIES: [&Entry; 8] = [
     &disk::ENTRY,
     &mouse::ENTRY,
     &test_tube::ENTRY,
+    &brush::ENTRY,
 ];

@@ -18,7 +18,7 @@ macro_rules! task_files {
     ($($name:literal),*) => { [$(($name, include_str!(concat!("../../../configs/tasks/", $name, ".toml")))),*] };
 }
 
-const TASKS: [(&str, &str); 8] = task_files![
+const TASKS: [(&str, &str); 9] = task_files![
     "cube_pick_place",
     "cylinder_pick_place",
     "cube_stack",
@@ -26,7 +26,8 @@ const TASKS: [(&str, &str); 8] = task_files![
     "nut_assembly",
     "disk",
     "mouse",
-    "test_tube"
+    "test_tube",
+    "brush"
 ];
 
 /// Everything that a run depends on besides its seed. Each preset file states every entry; see there for the reasons.

@@ -60,7 +60,7 @@ impl Task for CubePickPlace {
         let look = r#"class="holder" rgba=".16 .38 .62 1""#;
         let bodies = format!(
             r#"<body name="cube" pos="{} {} {HALF}"><freejoint/>
-              <geom class="item" contype="10" type="box" size="{HALF} {HALF} {HALF}" density="1000" rgba=".86 .20 .16 1"/>
+              <geom class="item" type="box" size="{HALF} {HALF} {HALF}" density="1000" rgba=".86 .20 .16 1"/>
             </body>
             <body name="tray" pos="{} {} 0">
               <geom class="holder" type="box" size="{INSIDE} {INSIDE} {}" pos="0 0 {}" rgba=".62 .78 .90 1"/>

@@ -67,7 +67,7 @@ impl Task for CubeStack {
         let cube = |name: &str, at: [f64; 2], color: &str| {
             format!(
                 r#"<body name="{name}" pos="{} {} {HALF}"><freejoint/>
-                  <geom class="item" contype="10" conaffinity="3" type="box" size="{HALF} {HALF} {HALF}" density="1000"
+                  <geom class="item" conaffinity="3" type="box" size="{HALF} {HALF} {HALF}" density="1000"
                     rgba="{color}"/></body>"#,
                 at[0], at[1]
             )

@@ -70,13 +70,14 @@ impl Task for CylinderPickPlace {
         };
         let bodies = format!(
             r#"<body name="cylinder" pos="{} {} {HALF}"><freejoint/>
-              <geom class="item" conaffinity="0" type="cylinder" size="{RADIUS} {HALF}" density="700" rgba=".20 .50 .85 1"/>
+              <geom class="item" conaffinity="0" type="cylinder" size="{RADIUS} {}" pos="0 0 .0005" density="700" rgba=".20 .50 .85 1"/>
               <geom class="scenery" type="cylinder" size="{} .0005" pos="0 0 {HALF}" mass="0" rgba=".90 .93 .97 1"/>
               {}{}</body>
             <body name="holder" pos="{} {} 0">{}
               <geom class="scenery" type="cylinder" size="{} .0006" pos="0 0 .0006" rgba=".25 .12 .05 1"/></body>"#,
             START.x[0],
             START.y[0],
+            HALF - 0.0005,
             RADIUS - 0.006,
             [-0.02, 0.0, 0.012, 0.022].map(ball).concat(),
             feet(8, RADIUS - 0.003, 0.003, -HALF),

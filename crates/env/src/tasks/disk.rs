@@ -75,7 +75,8 @@ impl Task for Disk {
     }
 
     fn scene(&self) -> String {
-        let plate = r#"class="item" density="1200" rgba=".55 .25 .65 1""#;
+        // The plate lies on its feet; the hub meets the table when the disk is upside down.
+        let plate = r#"class="item" contype="2" density="1200" rgba=".55 .25 .65 1""#;
         let hub = r#"class="item" density="1200" rgba=".90 .80 .30 1""#;
         let (radius, top) = ROD;
         let bodies = format!(

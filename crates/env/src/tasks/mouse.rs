@@ -57,7 +57,7 @@ impl Task for Mouse {
         let [x, y] = PAD;
         let bodies = format!(
             r#"<body name="mouse" pos="{} {} {c}"><freejoint/>
-              <geom class="item" contype="10" type="box" size="{a} {b} {c}" density="430" rgba=".20 .21 .25 1"/>
+              <geom class="item" type="box" size="{a} {b} {c}" density="430" rgba=".20 .21 .25 1"/>
               <geom class="scenery" type="box" size=".022 .013 .001" pos=".031 .0145 {c}" mass="0" rgba=".95 .75 .15 1"/>
               <geom class="scenery" type="box" size=".022 .013 .001" pos=".031 -.0145 {c}" mass="0" rgba=".95 .75 .15 1"/>
               <geom class="scenery" type="ellipsoid" size=".030 .022 .004" pos="-.022 0 {c}" mass="0" rgba=".45 .47 .55 1"/>

@@ -138,14 +138,7 @@ impl Task for TestTube {
             }
         };
         sim.set_object(&pose)?;
-        // A tube that tips rocks for a while.
-        for _ in 0..40 {
-            sim.settle(1);
-            if sim.speed(self.object())? < 1e-4 {
-                break;
-            }
-        }
-        Ok(())
+        sim.settle_object(40)
     }
 
     fn success(&self, direction: Direction, sim: &Sim) -> bool {

@@ -120,6 +120,7 @@ impl Env {
     /// None at present; kept for environments that refuse some states.
     pub fn begin(&mut self, direction: Direction) -> Result<()> {
         self.episode = Progress { direction, steps: 0, held: 0 };
+        self.sim.begin();
         Ok(())
     }
 

@@ -38,6 +38,10 @@ pub struct Sim {
     home: Command,
     tcp: usize,
     object: usize,
+    /// None where the arm carries a tool instead.
+    gripper: bool,
+    /// Pose of the object when the episode began.
+    object_start: Pose,
     robot_geoms: Vec<bool>,
     object_geoms: Vec<bool>,
 }
@@ -52,8 +56,13 @@ impl Sim {
         let body = find(MjtObjBase::mjOBJ_BODY, "body", object)?;
         let hand = find(MjtObjBase::mjOBJ_BODY, "body", "hand")?;
         let on = |body: usize| model.geom_bodyid().iter().map(|&b| b == body as i32).collect::<Vec<_>>();
-        let robot_geoms =
-            model.geom_bodyid().iter().map(|&b| (hand as i32..=hand as i32 + 2).contains(&b)).collect();
+        // What hangs on the hand, fingers or a tool, belongs to the robot.
+        let parent =
+            |body: i32| usize::try_from(body).ok().and_then(|b| model.body_parentid().get(b).copied());
+        let of_hand = |body: i32| {
+            std::iter::successors(Some(body), |&b| parent(b).filter(|_| b > 0)).any(|b| b == hand as i32)
+        };
+        let robot_geoms = model.geom_bodyid().iter().map(|&b| of_hand(b)).collect();
         let object_geoms = on(body);
 
         let mut arm = Arm::new(&model, tcp, pull);
@@ -62,10 +71,22 @@ impl Sim {
             return Err(Error::Unreachable { what: "home pose", error });
         }
         arm.set_posture(joints);
+        let gripper = model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, "grip").is_some();
         let command = Command { goal: *home, joints, open: true };
         let data = MjData::new(model.clone());
-        let mut sim =
-            Self { data, command, arm, home: command, tcp, object: body, robot_geoms, object_geoms, model };
+        let mut sim = Self {
+            data,
+            command,
+            arm,
+            home: command,
+            tcp,
+            object: body,
+            gripper,
+            object_start: *home,
+            robot_geoms,
+            object_geoms,
+            model,
+        };
         sim.clear(&joints);
         Ok(sim)
     }
@@ -74,9 +95,7 @@ impl Sim {
     pub(crate) fn clear(&mut self, joints: &[f64; JOINTS]) {
         self.data.reset();
         self.set_arm(joints);
-        self.data.qpos_mut()[GRIP..GRIP + 2].fill(FINGER_OPEN);
-        self.data.ctrl_mut()[GRIP] = FINGER_OPEN;
-        self.command.open = true;
+        self.set_gripper(2.0 * FINGER_OPEN, true);
         self.refresh();
     }
 
@@ -120,6 +139,16 @@ impl Sim {
         self.pose(self.object)
     }
 
+    /// Pose of the object when the episode began.
+    #[must_use]
+    pub fn object_start(&self) -> Pose {
+        self.object_start
+    }
+
+    pub(crate) fn begin(&mut self) {
+        self.object_start = self.object();
+    }
+
     /// Pose of a body of the scene.
     ///
     /// # Errors
@@ -160,9 +189,12 @@ impl Sim {
             .ok_or_else(|| Error::Missing { what: "free joint of body", name: body.to_string() })
     }
 
-    /// Distance between the fingers, m, in [0, [`MAX_OPENING`]].
+    /// Distance between the fingers, m, in [0, [`MAX_OPENING`]]; 0 without a gripper.
     #[must_use]
     pub fn opening(&self) -> f64 {
+        if !self.gripper {
+            return 0.0;
+        }
         let q = self.data.qpos();
         (q[GRIP] + q[GRIP + 1]).clamp(0.0, MAX_OPENING)
     }
@@ -225,15 +257,57 @@ impl Sim {
     /// # Errors
     /// When the arm cannot reach the pose, or the object is not a free body.
     pub fn set_holding(&mut self, tcp: &Pose, object: &Pose, opening: f64) -> Result<()> {
+        self.set_tcp(tcp)?;
+        self.set_gripper(opening, false);
+        self.set_object(object)
+    }
+
+    /// Puts the arm at rest with the tool centre point at a pose.
+    ///
+    /// # Errors
+    /// When the arm cannot reach it.
+    pub fn set_tcp(&mut self, tcp: &Pose) -> Result<()> {
+        let joints = self.joints_for(tcp)?;
+        self.set_arm(&joints);
+        self.refresh();
+        Ok(())
+    }
+
+    /// Joint angles, rad, with which the arm holds its tool centre point at a pose; for a second arm like it, in the frame
+    /// of that one's base.
+    ///
+    /// # Errors
+    /// When the arm cannot reach it.
+    pub fn joints_for(&mut self, tcp: &Pose) -> Result<[f64; JOINTS]> {
         let (joints, error) = self.arm.solve(tcp, &self.home.joints, 200);
         if error > 1e-3 {
             return Err(Error::Unreachable { what: "start pose of the hand", error });
         }
-        self.set_arm(&joints);
-        self.data.qpos_mut()[GRIP..GRIP + 2].fill(0.5 * opening);
-        self.data.ctrl_mut()[GRIP] = FINGER_CLOSED;
-        self.command.open = false;
-        self.set_object(object)
+        Ok(joints)
+    }
+
+    /// Puts the second arm of a scene of two at rest at joint angles, which it then holds.
+    ///
+    /// # Errors
+    /// When the scene has no second arm.
+    pub fn set_second_arm(&mut self, joints: &[f64; JOINTS]) -> Result<()> {
+        let missing = || Error::Missing { what: "actuator", name: "second_a1".to_owned() };
+        let actuator = self.model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, "second_a1").ok_or_else(missing)?;
+        let joint = self.model.name_to_id(MjtObjBase::mjOBJ_JOINT, "second_joint1").ok_or_else(missing)?;
+        let qpos = self.model.jnt_qposadr().get(joint).and_then(|&q| usize::try_from(q).ok());
+        let qpos = qpos.ok_or_else(missing)?;
+        self.data.qpos_mut()[qpos..qpos + JOINTS].copy_from_slice(joints);
+        self.data.ctrl_mut()[actuator..actuator + JOINTS].copy_from_slice(joints);
+        self.refresh();
+        Ok(())
+    }
+
+    fn set_gripper(&mut self, opening: f64, open: bool) {
+        self.command.open = open;
+        if self.gripper {
+            self.data.qpos_mut()[GRIP..GRIP + 2].fill(0.5 * opening);
+            self.data.ctrl_mut()[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+        }
     }
 
     fn set_arm(&mut self, joints: &[f64; JOINTS]) {
@@ -318,7 +392,9 @@ impl Sim {
                 let step = joints[j] - from[j];
                 ctrl[j] = from[j] + step * (k as f64 / steps) + lead[j] * step / (steps * dt);
             }
-            ctrl[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+            if self.gripper {
+                ctrl[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+            }
             self.data.step();
         }
         self.command.joints = *joints;
@@ -352,27 +428,35 @@ impl Sim {
         state.extend([q.w, q.i, q.j, q.k]);
         state.extend(self.command.joints);
         state.push(f64::from(u8::from(self.command.open)));
+        let q = self.object_start.orientation.quaternion();
+        state.extend(self.object_start.position.iter());
+        state.extend([q.w, q.i, q.j, q.k]);
         state
     }
 
     /// Back to a state of [`Self::save`]; the numbers after it are returned.
     pub(crate) fn restore<'a>(&mut self, state: &'a [f64]) -> Result<&'a [f64]> {
         let physics = self.model.state_size(STATE);
-        let expected = physics + 7 + JOINTS + 1;
+        let expected = physics + 7 + JOINTS + 1 + 7;
         if state.len() < expected {
             return Err(Error::State { expected, found: state.len() });
         }
         let (physics, rest) = state.split_at(physics);
         self.data.set_state(physics, STATE).map_err(|e| Error::MuJoCo(e.to_string()))?;
-        let q = Quaternion::new(rest[3], rest[4], rest[5], rest[6]);
-        // Unchecked: normalising again would change the last bit of a quaternion that was saved normalised.
-        let orientation = UnitQuaternion::new_unchecked(q);
-        self.command.goal = Pose::new(Vector3::new(rest[0], rest[1], rest[2]), orientation);
+        self.command.goal = pose_from(rest);
         self.command.joints.copy_from_slice(&rest[7..7 + JOINTS]);
         self.command.open = rest[7 + JOINTS] > 0.5;
+        self.object_start = pose_from(&rest[8 + JOINTS..]);
         self.refresh();
-        Ok(&rest[8 + JOINTS..])
+        Ok(&rest[15 + JOINTS..])
     }
+}
+
+/// A pose from seven numbers. Unchecked: normalising again would change the last bit of a quaternion that was saved
+/// normalised.
+fn pose_from(row: &[f64]) -> Pose {
+    let orientation = UnitQuaternion::new_unchecked(Quaternion::new(row[3], row[4], row[5], row[6]));
+    Pose::new(Vector3::new(row[0], row[1], row[2]), orientation)
 }
 
 /// Pose of a site.

@@ -18,12 +18,13 @@ macro_rules! task_files {
     ($($name:literal),*) => { [$(($name, include_str!(concat!("../../../configs/tasks/", $name, ".toml")))),*] };
 }
 
-const TASKS: [(&str, &str); 9] = task_files![
+const TASKS: [(&str, &str); 10] = task_files![
     "cube_pick_place",
     "cylinder_pick_place",
     "cube_stack",
     "rod_insertion",
     "nut_assembly",
+    "peg_insertion",
     "disk",
     "mouse",
     "test_tube",

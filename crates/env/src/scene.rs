@@ -18,7 +18,7 @@ pub struct TableCamera {
 impl Default for TableCamera {
     /// From the far side of the table, over the middle of what the arm reaches.
     fn default() -> Self {
-        Self { position: [1.02, 0.26, 0.50], target: [0.54, -0.01, 0.05], fovy: 32.0 }
+        Self { position: [1.02, 0.26, 0.50], target: [0.55, 0.015, 0.04], fovy: 29.0 }
     }
 }
 

@@ -18,7 +18,7 @@ const RADIUS: f64 = 0.009;
 const HANDLE_END: f64 = 0.09;
 const HEAD: [f64; 2] = [0.030, 0.075];
 /// Half the width and thickness of the head, m.
-const HEAD_HALF: [f64; 2] = [0.018, 0.008];
+const HEAD_HALF: [f64; 2] = [0.013, 0.008];
 /// The holder: place, rim and floor, m.
 const HOLDER: [f64; 2] = [0.62, 0.08];
 const RIM: f64 = 0.07;
@@ -96,6 +96,7 @@ impl Task for Brush {
         let under_head = z - thick;
         let under_handle = z - RADIUS;
         let wood = r#"class="holder" type="box" rgba=".50 .34 .20 1""#;
+        // The mat shows where the holder is when the head hides it from the wrist camera.
         let bodies = format!(
             r#"<body name="brush" pos="{x} {y} {z}" euler="0 {FRAC_PI_2} 0"><freejoint/>
               <geom class="item" type="capsule" size="{RADIUS}" fromto="0 0 {} 0 0 {}" density="2000" rgba=".85 .18 .16 1"/>
@@ -103,7 +104,8 @@ impl Task for Brush {
               <geom class="scenery" type="box" size="{} {} .005" pos="0 0 {}" mass="0" rgba=".75 .75 .78 1"/>
               {}</body>
             <body name="holder" pos="{} {} 0">{}
-              <geom class="holder" type="cylinder" size="{} {}" pos="0 0 {}" rgba=".10 .12 .16 1"/></body>
+              <geom class="holder" type="cylinder" size="{} {}" pos="0 0 {}" rgba=".10 .12 .16 1"/>
+              <geom class="scenery" type="cylinder" size=".085 .0006" pos="0 0 .0006" rgba=".55 .78 .92 1"/></body>
             <body name="cradle" pos="{x} {y} 0">
               <geom {wood} size=".012 .03 {}" pos="{middle} 0 {}"/>
               <geom {wood} size=".008 .025 {}" pos="-.07 0 {}"/>

@@ -79,11 +79,12 @@ impl Task for Disk {
         let plate = r#"class="item" contype="2" density="1200" rgba=".55 .25 .65 1""#;
         let hub = r#"class="item" density="1200" rgba=".90 .80 .30 1""#;
         let (radius, top) = ROD;
+        // The mat shows where the rod is when the disk hides it from the wrist camera.
         let bodies = format!(
             r#"<body name="disk" pos="{} {} {HALF}"><freejoint/>{}{}{}</body>
             <body name="rod" pos="{} {} 0">
               <geom class="holder" type="capsule" size="{radius}" fromto="0 0 0 0 0 {}" rgba=".12 .45 .25 1"/>
-              <geom class="scenery" type="cylinder" size=".03 .0006" pos="0 0 .0006" rgba=".12 .30 .20 1"/></body>"#,
+              <geom class="scenery" type="cylinder" size=".07 .0006" pos="0 0 .0006" rgba=".45 .80 .55 1"/></body>"#,
             START.x[0],
             START.y[0],
             self.ring(plate, RADIUS, [-HALF, HALF]),

@@ -186,7 +186,10 @@ impl Sim {
             .and_then(|j| {
                 Some((index(self.model.jnt_qposadr().get(j))?, index(self.model.jnt_dofadr().get(j))?))
             })
-            .ok_or_else(|| Error::Missing { what: "free joint of body", name: body.to_string() })
+            .ok_or_else(|| {
+                let name = self.model.id_to_name(MjtObjBase::mjOBJ_BODY, body).unwrap_or_default();
+                Error::Missing { what: "free joint of body", name: name.to_owned() }
+            })
     }
 
     /// Distance between the fingers, m, in [0, [`MAX_OPENING`]]; 0 without a gripper.

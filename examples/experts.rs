@@ -83,7 +83,7 @@ fn measure(name: &str, arguments: &Arguments) -> Result<Count> {
         options.demonstrator = e2h_env::DemonstratorConfig::clean();
     }
     let task = task(name, &options)?;
-    let first = Env::new(task.clone(), &EnvConfig::blind())?;
+    let first = Env::new(task.clone(), &EnvConfig::physics(&*task))?;
     let workers = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     // Trials are split by worker, but what one does depends on its index alone.
     let parts: Vec<Result<Count>> = std::thread::scope(|scope| {

@@ -75,3 +75,14 @@ fn methods_name_no_task_and_tasks_no_method() {
         }
     }
 }
+
+#[test]
+fn every_pair_has_a_program_and_a_configuration_of_its_own() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for name in auto_e2h::env::registry() {
+        let read = |path: String| std::fs::read_to_string(root.join(&path)).expect(&path);
+        let program = read(format!("examples/{name}.rs"));
+        assert!(program.contains(&format!("common::options(\"{name}\")")), "{name}");
+        assert!(read(format!("configs/tasks/{name}.toml")).contains(&format!("name = \"{name}\"")));
+    }
+}

@@ -13,7 +13,19 @@ const READY: [f64; JOINTS] = [0.0, -0.35, 0.0, -2.25, 0.0, 1.9, 0.785];
 const MAX_JOINT_STEP: f64 = 0.125;
 const POSITION_TOLERANCE: f64 = 1e-5; // m
 const ROTATION_TOLERANCE: f64 = 1e-4; // rad
-const POSTURE_PULL: f64 = 0.05; // share of the way to the posture in the null space, each iteration
+const POSTURE_PULL: f64 = 0.05; // share of the way to the posture in the null space, each time that it is drawn there
+
+/// When the inverse kinematics draws the arm towards its home posture in the null space.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum PosturePull {
+    /// Once a control step, in the first iteration: the null space moves evenly, and the iterations after it converge.
+    #[default]
+    Once,
+    /// In every iteration. How many there are (3 or 20) hangs on the last digits of the error, so the null space moves by
+    /// fits and starts; near an upright shoulder, where joints 1 and 3 turn about the same axis, such a start can drive both
+    /// into their force limits and the hand centimetres off its goal. Kept for policies that were trained with it.
+    Repeated,
+}
 
 /// Inverse kinematics, on data of its own so that the simulation is not touched.
 pub(crate) struct Arm {
@@ -22,10 +34,11 @@ pub(crate) struct Arm {
     posture: [f64; JOINTS],
     ranges: [[f64; 2]; JOINTS],
     lead: [f64; JOINTS],
+    pull: PosturePull,
 }
 
 impl Arm {
-    pub(crate) fn new(model: &Arc<MjModel>, tcp: usize) -> Self {
+    pub(crate) fn new(model: &Arc<MjModel>, tcp: usize, pull: PosturePull) -> Self {
         let mut ranges = [[0.0; 2]; JOINTS];
         let mut lead = [0.0; JOINTS];
         for j in 0..JOINTS {
@@ -34,7 +47,7 @@ impl Arm {
             let [kp, kv] = [model.actuator_gainprm()[j][0], -model.actuator_biasprm()[j][2]];
             lead[j] = (kv + 1.0) / kp;
         }
-        Self { scratch: MjData::new(model.clone()), tcp, posture: READY, ranges, lead }
+        Self { scratch: MjData::new(model.clone()), tcp, posture: READY, ranges, lead, pull }
     }
 
     pub(crate) fn posture(&self) -> [f64; JOINTS] {
@@ -75,7 +88,7 @@ impl Arm {
         let posture = SVector::from(self.posture);
         let mut q = SVector::from(*from);
         let mut left = f64::INFINITY;
-        for _ in 0..iterations {
+        for iteration in 0..iterations {
             let here = self.pose(&q.into());
             let move_by = goal.position - here.position;
             let turn_by = (goal.orientation * here.orientation.inverse()).scaled_axis();
@@ -88,7 +101,8 @@ impl Arm {
             let damping = 1e-4 + 1e-2 * error.norm_squared();
             let square = jacobian * jacobian.transpose() + Matrix6::identity() * damping;
             let Some(factor) = square.cholesky() else { break }; // positive definite unless a goal is not finite
-            let pull = (posture - q) * POSTURE_PULL;
+            let drawn = iteration == 0 || self.pull == PosturePull::Repeated;
+            let pull = (posture - q) * if drawn { POSTURE_PULL } else { 0.0 };
             let mut step = jacobian.transpose() * factor.solve(&(error - jacobian * pull)) + pull;
             let most = step.amax();
             if most > 0.2 {

@@ -1,3 +1,5 @@
+use crate::Task;
+use e2h_core::Direction;
 use serde::{Deserialize, Serialize};
 
 /// What an [`Env`](crate::Env) is built with, beside its task.
@@ -38,6 +40,16 @@ impl Default for EnvConfig {
 }
 
 impl EnvConfig {
+    /// The defaults without images, with the horizons of a task: for measuring demonstrators.
+    #[must_use]
+    pub fn physics(task: &dyn Task) -> Self {
+        Self {
+            horizon_hard: task.horizon(Direction::Hard),
+            horizon_easy: task.horizon(Direction::Easy),
+            ..Self::blind()
+        }
+    }
+
     /// The defaults without images: for physics alone.
     #[must_use]
     pub fn blind() -> Self {
@@ -51,6 +63,8 @@ impl EnvConfig {
 pub struct TaskOptions {
     /// Name of the variant; empty for the task's default.
     pub variant: String,
+    /// Free space between the object and the hole or holder that it goes into, m a side; 0 for the task's default.
+    pub clearance: f64,
     /// The scripted demonstrator.
     pub demonstrator: DemonstratorConfig,
 }

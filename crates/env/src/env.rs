@@ -52,7 +52,7 @@ impl Env {
     }
 
     fn with_model(task: Arc<dyn Task>, config: &EnvConfig, model: Arc<MjModel>) -> Result<Self> {
-        let sim = Sim::new(model, task.object(), &task.home())?;
+        let sim = Sim::new(model, task.object(), &task.home(), task.posture_pull())?;
         let cameras = if config.cameras { CAMERAS.map(str::to_owned).to_vec() } else { vec![] };
         let episode = Progress { direction: Direction::Hard, steps: 0, held: 0 };
         Ok(Self { task, config: config.clone(), cameras, sim, renderer: Renderer::default(), episode })
@@ -100,12 +100,12 @@ impl Env {
     /// An external reset: the arm at home (with a little noise), the object at a start of `direction`; begins an episode.
     ///
     /// # Errors
-    /// When the start diverges, which a sound task never does.
+    /// When the arm cannot reach the start, or the start diverges; a sound task never does either.
     pub fn reset(&mut self, direction: Direction, rng: &mut Rng) -> Result<()> {
         let home = self.sim.home_joints();
         let joints: [f64; JOINTS] = std::array::from_fn(|j| home[j] + gauss(rng, self.config.home_noise_rad));
         self.sim.clear(&joints);
-        self.task.place(direction, &mut self.sim, rng);
+        self.task.place(direction, &mut self.sim, rng)?;
         let trouble = self.sim.trouble();
         self.sim.settle(SETTLE);
         if self.sim.trouble() != trouble {
@@ -120,15 +120,19 @@ impl Env {
     /// None at present; kept for environments that refuse some states.
     pub fn begin(&mut self, direction: Direction) -> Result<()> {
         self.episode = Progress { direction, steps: 0, held: 0 };
+        self.sim.begin();
         Ok(())
     }
 
     /// Takes the arm home without a reset: opens the gripper, rises straight up, goes to the home posture. Not part of
-    /// an episode, so its counters stand still.
+    /// an episode, so its counters stand still. Where episodes do not start from there ([`Task::homes`]) nothing moves.
     ///
     /// # Errors
     /// When the simulation diverges on the way.
     pub fn home(&mut self) -> Result<()> {
+        if !self.task.homes() {
+            return Ok(());
+        }
         let trouble = self.sim.trouble();
         self.sim.settle_open(OPENING);
         let home = self.sim.home();
@@ -187,13 +191,14 @@ impl Env {
     }
 
     /// One control step. The outcome is there when the episode ended with it: success held for
-    /// [`EnvConfig::hold_steps`], the horizon, or a simulation that ran away (which needs a [`Self::reset`]).
+    /// [`EnvConfig::hold_steps`], the horizon, an object that was dropped where it must be held, or a simulation that ran
+    /// away (these two need a [`Self::reset`]).
     ///
     /// # Errors
     /// An action with a number that is not finite, or a quaternion without direction. Nothing has moved then.
     pub fn step(&mut self, action: &Action) -> Result<Option<Outcome>> {
-        if self.advance(action)? {
-            return Ok(Some(Outcome::Diverged));
+        if let Some(accident) = self.advance(action)? {
+            return Ok(Some(accident));
         }
         let timeout = self.episode.steps >= self.horizon(self.episode.direction);
         Ok(self.held().or(timeout.then_some(Outcome::Timeout)))
@@ -205,8 +210,8 @@ impl Env {
         (held >= self.config.hold_steps.max(1)).then(|| Outcome::Success { at: steps - held })
     }
 
-    /// One control step without an end; true when the simulation diverged.
-    pub(crate) fn advance(&mut self, action: &Action) -> Result<bool> {
+    /// One control step that ends only by accident: a simulation that diverged, an object that was dropped.
+    pub(crate) fn advance(&mut self, action: &Action) -> Result<Option<Outcome>> {
         check(action)?;
         let (trouble, time) = (self.sim.trouble(), self.sim.time());
         let goal = Pose::from_row(&action[..7]);
@@ -214,11 +219,14 @@ impl Env {
         self.sim.drive(&goal, open, self.config.max_goal_step_m, self.config.max_goal_step_rad);
         self.episode.steps += 1;
         if self.sim.trouble() != trouble || self.sim.time() <= time {
-            return Ok(true);
+            return Ok(Some(Outcome::Diverged));
+        }
+        if self.task.holds() && !self.sim.touching() {
+            return Ok(Some(Outcome::Dropped));
         }
         let good = self.task.success(self.episode.direction, &self.sim);
         self.episode.held = if good { self.episode.held + 1 } else { 0 };
-        Ok(false)
+        Ok(None)
     }
 
     /// Whether the scene is in a goal state of `direction` right now.

@@ -70,7 +70,7 @@ const METRES_PER_RADIAN: f64 = 0.25;
 const DT: f64 = 1.0 / CONTROL_HZ;
 
 impl Script {
-    /// A script that draws its variation from a fork of `rng`. The gripper starts open.
+    /// A script that draws its variation from a fork of `rng`. The gripper starts as it is.
     pub fn new(
         config: &DemonstratorConfig,
         rng: &mut Rng,
@@ -137,7 +137,10 @@ impl Script {
 
 impl Expert for Script {
     fn act(&mut self, sim: &Sim) -> Action {
-        let mut goal = *self.goal.get_or_insert_with(|| sim.goal());
+        let mut goal = self.goal.unwrap_or_else(|| {
+            self.open = sim.opens();
+            sim.goal()
+        });
         loop {
             match self.now.last_mut() {
                 None => match (self.plan)(self.next, sim, &mut self.rng) {
@@ -216,4 +219,9 @@ pub(crate) fn draw(rng: &mut Rng, [low, high]: [f64; 2]) -> f64 {
 /// Normal with mean zero; zero when the deviation is not a number to draw with.
 pub(crate) fn gauss(rng: &mut Rng, deviation: f64) -> f64 {
     Normal::new(0.0, deviation).map_or(0.0, |n| n.sample(rng))
+}
+
+/// A normal step in the plane, m.
+pub(crate) fn scatter(rng: &mut Rng, deviation: f64) -> Vector3<f64> {
+    Vector3::new(gauss(rng, deviation), gauss(rng, deviation), 0.0)
 }

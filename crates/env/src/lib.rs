@@ -22,22 +22,26 @@ mod config;
 mod env;
 mod expert;
 mod logging;
-mod nut;
+mod mjcf;
+mod pick_place;
 mod record;
 mod render;
 mod scene;
 mod sim;
+mod tabletop;
 mod task;
+mod tasks;
 
+pub use arm::PosturePull;
 pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
 pub use env::Env;
 pub use expert::{Expert, Phase, Script};
-pub use nut::NutAssembly;
 pub use record::{demonstrate, replay};
 pub use render::Style;
 pub use scene::{TableCamera, compose};
 pub use sim::{MAX_OPENING, SUBSTEPS, Sim};
 pub use task::{Task, registry, task, variants};
+pub use tasks::*;
 
 /// What can go wrong in an environment.
 #[derive(Debug, thiserror::Error)]
@@ -73,6 +77,16 @@ pub enum Error {
         what: &'static str,
         /// Distance left over, m plus rad.
         error: f64,
+    },
+    /// A clearance that a task's scene has no room for.
+    #[error("clearance of `{task}`: expected {expected}, got {found}")]
+    Clearance {
+        /// The task.
+        task: &'static str,
+        /// What it can be.
+        expected: String,
+        /// What was asked for, m a side.
+        found: f64,
     },
     /// An action that no controller can follow.
     #[error("action: expected {expected}, got {found:?}")]

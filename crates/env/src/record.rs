@@ -22,8 +22,8 @@ pub fn demonstrate(
         let observation = env.observe()?;
         let action = expert.act(env.sim());
         episode.push(&observation, &action)?;
-        if env.advance(&action)? {
-            episode.outcome = Outcome::Diverged;
+        if let Some(accident) = env.advance(&action)? {
+            episode.outcome = accident;
             return Ok(episode);
         }
         if expert.done() {

@@ -15,15 +15,62 @@ pub struct TableCamera {
     pub fovy: f64,
 }
 
+impl Default for TableCamera {
+    /// From the far side of the table, over the middle of what the arm reaches.
+    fn default() -> Self {
+        Self { position: [1.02, 0.26, 0.50], target: [0.55, 0.015, 0.04], fovy: 29.0 }
+    }
+}
+
 /// The robot's scene (MJCF) with the bodies of a task (`bodies`, MJCF elements of the world body), the fixed camera
 /// `table` and the camera `wrist` on the hand.
 #[must_use]
 pub fn compose(bodies: &str, camera: &TableCamera) -> String {
+    cameras(PANDA, camera).replace("<!--TASK-->", bodies)
+}
+
+/// A scene of two arms without grippers, with tools (MJCF elements of the hand's body, where z points out of the flange)
+/// instead. The first arm has the camera `wrist`, and its tool the site `tcp`; the second stands at `base`, m, and its names
+/// begin with `second_`.
+pub(crate) fn compose_two_arms(
+    tools: [&str; 2],
+    base: [f64; 3],
+    bodies: &str,
+    camera: &TableCamera,
+) -> String {
+    let bare = without(PANDA, "gripper");
+    let mut parts = sections(&bare, "arm").map(|text| {
+        let text = text.replace("name=\"", "name=\"second_").replace("joint=\"", "joint=\"second_");
+        text.replace("<!--WRIST-->", "").replace("<!--TOOL-->", tools[1])
+    });
+    let [body, actuators] = [parts.next(), parts.next()].map(Option::unwrap_or_default);
+    let [x, y, z] = base;
+    let second = format!(r#"<body name="second_base" pos="{x} {y} {z}">{body}</body>{bodies}"#);
+    let scene = cameras(&bare, camera).replace("<!--TOOL-->", tools[0]);
+    scene.replace("<!--TASK-->", &second).replace("<!--ACTUATORS-->", &actuators)
+}
+
+/// What stands between each pair of markers of a name.
+fn sections<'a>(text: &'a str, name: &str) -> impl Iterator<Item = &'a str> {
+    let end = format!("<!--/{name}-->");
+    text.split(&*format!("<!--{name}-->"))
+        .skip(1)
+        .filter_map(move |rest| rest.split_once(&*end).map(|(section, _)| section))
+        .collect::<Vec<_>>()
+        .into_iter()
+}
+
+/// The text without those sections.
+fn without(text: &str, name: &str) -> String {
+    sections(text, name).fold(text.to_owned(), |text, section| text.replace(section, ""))
+}
+
+fn cameras(text: &str, camera: &TableCamera) -> String {
     let table = camera_xml("table", camera.position, camera.target, [0.0, 0.0, 1.0], camera.fovy);
     // In the frame of the hand z points to the fingertips and x forward. The camera hangs in front of the hand, so that the
     // fingertips are at the lower edge of the image and what they hold above them.
     let wrist = camera_xml("wrist", [0.11, 0.0, -0.03], [0.086, 0.0, 0.2], [1.0, 0.0, 0.0], 84.0);
-    PANDA.replace("<!--CAMERAS-->", &table).replace("<!--WRIST-->", &wrist).replace("<!--TASK-->", bodies)
+    text.replace("<!--CAMERAS-->", &table).replace("<!--WRIST-->", &wrist)
 }
 
 /// A camera element that looks from `position` at `target` with `up` upwards in the image.

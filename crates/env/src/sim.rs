@@ -1,6 +1,7 @@
-use crate::{Error, Result, arm::Arm, arm::JOINTS};
+use crate::arm::{Arm, JOINTS, PosturePull};
+use crate::{Error, Result};
 use e2h_core::Pose;
-use mujoco_rs::prelude::{MjData, MjModel, MjtObjBase, MjtState, MjtWarning};
+use mujoco_rs::prelude::{MjData, MjModel, MjtJoint, MjtObjBase, MjtState, MjtWarning};
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::sync::Arc;
 
@@ -37,39 +38,40 @@ pub struct Sim {
     home: Command,
     tcp: usize,
     object: usize,
-    object_qpos: usize,
-    object_dof: usize,
+    /// None where the arm carries a tool instead.
+    gripper: bool,
+    /// Pose of the object when the episode began.
+    object_start: Pose,
     robot_geoms: Vec<bool>,
     object_geoms: Vec<bool>,
 }
 
 impl Sim {
     /// A scene with the arm at the posture that holds the tool centre point at `home`.
-    pub(crate) fn new(model: Arc<MjModel>, object: &str, home: &Pose) -> Result<Self> {
+    pub(crate) fn new(model: Arc<MjModel>, object: &str, home: &Pose, pull: PosturePull) -> Result<Self> {
         let find = |kind, what, name: &str| {
             model.name_to_id(kind, name).ok_or_else(|| Error::Missing { what, name: name.to_owned() })
         };
         let tcp = find(MjtObjBase::mjOBJ_SITE, "site", "tcp")?;
         let body = find(MjtObjBase::mjOBJ_BODY, "body", object)?;
         let hand = find(MjtObjBase::mjOBJ_BODY, "body", "hand")?;
-        let joint = model
-            .body_jntadr()
-            .get(body)
-            .and_then(|&j| usize::try_from(j).ok())
-            .ok_or(Error::Missing { what: "free joint of the object", name: object.to_owned() })?;
-        let address = |all: &[i32]| all.get(joint).and_then(|&a| usize::try_from(a).ok()).unwrap_or(0);
-        let (object_qpos, object_dof) = (address(model.jnt_qposadr()), address(model.jnt_dofadr()));
         let on = |body: usize| model.geom_bodyid().iter().map(|&b| b == body as i32).collect::<Vec<_>>();
-        let robot_geoms =
-            model.geom_bodyid().iter().map(|&b| (hand as i32..=hand as i32 + 2).contains(&b)).collect();
+        // What hangs on the hand, fingers or a tool, belongs to the robot.
+        let parent =
+            |body: i32| usize::try_from(body).ok().and_then(|b| model.body_parentid().get(b).copied());
+        let of_hand = |body: i32| {
+            std::iter::successors(Some(body), |&b| parent(b).filter(|_| b > 0)).any(|b| b == hand as i32)
+        };
+        let robot_geoms = model.geom_bodyid().iter().map(|&b| of_hand(b)).collect();
         let object_geoms = on(body);
 
-        let mut arm = Arm::new(&model, tcp);
+        let mut arm = Arm::new(&model, tcp, pull);
         let (joints, error) = arm.solve(home, &arm.posture(), 200);
         if error > 1e-4 {
             return Err(Error::Unreachable { what: "home pose", error });
         }
         arm.set_posture(joints);
+        let gripper = model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, "grip").is_some();
         let command = Command { goal: *home, joints, open: true };
         let data = MjData::new(model.clone());
         let mut sim = Self {
@@ -79,8 +81,8 @@ impl Sim {
             home: command,
             tcp,
             object: body,
-            object_qpos,
-            object_dof,
+            gripper,
+            object_start: *home,
             robot_geoms,
             object_geoms,
             model,
@@ -92,13 +94,8 @@ impl Sim {
     /// Puts everything at rest: the arm at `joints`, the gripper open, the object where the scene has it.
     pub(crate) fn clear(&mut self, joints: &[f64; JOINTS]) {
         self.data.reset();
-        let qpos = self.data.qpos_mut();
-        qpos[..JOINTS].copy_from_slice(joints);
-        qpos[GRIP..GRIP + 2].fill(FINGER_OPEN);
-        let ctrl = self.data.ctrl_mut();
-        ctrl[..JOINTS].copy_from_slice(joints);
-        ctrl[GRIP] = FINGER_OPEN;
-        self.command = Command { goal: self.arm.pose(joints), joints: *joints, open: true };
+        self.set_arm(joints);
+        self.set_gripper(2.0 * FINGER_OPEN, true);
         self.refresh();
     }
 
@@ -126,6 +123,12 @@ impl Sim {
         self.home.goal
     }
 
+    /// The gripper command that holds at the moment: true for open.
+    #[must_use]
+    pub fn opens(&self) -> bool {
+        self.command.open
+    }
+
     pub(crate) fn home_joints(&self) -> [f64; JOINTS] {
         self.home.joints
     }
@@ -133,21 +136,68 @@ impl Sim {
     /// Pose of the object.
     #[must_use]
     pub fn object(&self) -> Pose {
-        let (p, q) = (self.data.xpos()[self.object], self.data.xquat()[self.object]);
+        self.pose(self.object)
+    }
+
+    /// Pose of the object when the episode began.
+    #[must_use]
+    pub fn object_start(&self) -> Pose {
+        self.object_start
+    }
+
+    pub(crate) fn begin(&mut self) {
+        self.object_start = self.object();
+    }
+
+    /// Pose of a body of the scene.
+    ///
+    /// # Errors
+    /// When there is no such body.
+    pub fn body(&self, name: &str) -> Result<Pose> {
+        Ok(self.pose(self.body_id(name)?))
+    }
+
+    /// Speed of the frame of a free body, m/s.
+    ///
+    /// # Errors
+    /// When there is no such body, or it is not free.
+    pub fn speed(&self, name: &str) -> Result<f64> {
+        let (_, dof) = self.free_joint(self.body_id(name)?)?;
+        Ok(Vector3::from_row_slice(&self.data.qvel()[dof..dof + 3]).norm())
+    }
+
+    fn pose(&self, body: usize) -> Pose {
+        let (p, q) = (self.data.xpos()[body], self.data.xquat()[body]);
         let q = Quaternion::new(q[0], q[1], q[2], q[3]);
         Pose::new(Vector3::from(p), UnitQuaternion::try_new(q, 1e-9).unwrap_or_else(UnitQuaternion::identity))
     }
 
-    /// Speed of the object's frame, m/s.
-    #[must_use]
-    pub fn object_speed(&self) -> f64 {
-        let v = &self.data.qvel()[self.object_dof..self.object_dof + 3];
-        Vector3::from_row_slice(v).norm()
+    fn body_id(&self, name: &str) -> Result<usize> {
+        self.model
+            .name_to_id(MjtObjBase::mjOBJ_BODY, name)
+            .ok_or_else(|| Error::Missing { what: "body", name: name.to_owned() })
     }
 
-    /// Distance between the fingers, m, in [0, [`MAX_OPENING`]].
+    /// Where positions and velocities of a free body begin.
+    fn free_joint(&self, body: usize) -> Result<(usize, usize)> {
+        let index = |v: Option<&i32>| v.and_then(|&v| usize::try_from(v).ok());
+        index(self.model.body_jntadr().get(body))
+            .filter(|&j| self.model.jnt_type().get(j) == Some(&MjtJoint::mjJNT_FREE))
+            .and_then(|j| {
+                Some((index(self.model.jnt_qposadr().get(j))?, index(self.model.jnt_dofadr().get(j))?))
+            })
+            .ok_or_else(|| {
+                let name = self.model.id_to_name(MjtObjBase::mjOBJ_BODY, body).unwrap_or_default();
+                Error::Missing { what: "free joint of body", name: name.to_owned() }
+            })
+    }
+
+    /// Distance between the fingers, m, in [0, [`MAX_OPENING`]]; 0 without a gripper.
     #[must_use]
     pub fn opening(&self) -> f64 {
+        if !self.gripper {
+            return 0.0;
+        }
         let q = self.data.qpos();
         (q[GRIP] + q[GRIP + 1]).clamp(0.0, MAX_OPENING)
     }
@@ -166,6 +216,12 @@ impl Sim {
         })
     }
 
+    /// Depth of the deepest contact, m.
+    #[must_use]
+    pub fn penetration(&self) -> f64 {
+        self.data.contact().iter().map(|c| -c.dist).fold(0.0, f64::max)
+    }
+
     /// Whether the gripper is open and clear of the object.
     #[must_use]
     pub fn released(&self) -> bool {
@@ -173,14 +229,95 @@ impl Sim {
     }
 
     /// Puts the object at rest at a pose.
-    pub fn set_object(&mut self, pose: &Pose) {
+    ///
+    /// # Errors
+    /// When the object is not a free body.
+    pub fn set_object(&mut self, pose: &Pose) -> Result<()> {
+        self.set(self.object, pose)
+    }
+
+    /// Puts a free body at rest at a pose.
+    ///
+    /// # Errors
+    /// When there is no such body, or it is not free.
+    pub fn set_body(&mut self, name: &str, pose: &Pose) -> Result<()> {
+        self.set(self.body_id(name)?, pose)
+    }
+
+    fn set(&mut self, body: usize, pose: &Pose) -> Result<()> {
+        let (qpos, dof) = self.free_joint(body)?;
         let q = pose.orientation.quaternion();
         let row = [pose.position.x, pose.position.y, pose.position.z, q.w, q.i, q.j, q.k];
-        let at = self.object_qpos;
-        self.data.qpos_mut()[at..at + 7].copy_from_slice(&row);
-        let at = self.object_dof;
-        self.data.qvel_mut()[at..at + 6].fill(0.0);
+        self.data.qpos_mut()[qpos..qpos + 7].copy_from_slice(&row);
+        self.data.qvel_mut()[dof..dof + 6].fill(0.0);
         self.refresh();
+        Ok(())
+    }
+
+    /// Puts the arm at rest with the tool centre point at a pose, and the object between its fingers at a pose; the
+    /// fingers close from `opening`, m.
+    ///
+    /// # Errors
+    /// When the arm cannot reach the pose, or the object is not a free body.
+    pub fn set_holding(&mut self, tcp: &Pose, object: &Pose, opening: f64) -> Result<()> {
+        self.set_tcp(tcp)?;
+        self.set_gripper(opening, false);
+        self.set_object(object)
+    }
+
+    /// Puts the arm at rest with the tool centre point at a pose.
+    ///
+    /// # Errors
+    /// When the arm cannot reach it.
+    pub fn set_tcp(&mut self, tcp: &Pose) -> Result<()> {
+        let joints = self.joints_for(tcp)?;
+        self.set_arm(&joints);
+        self.refresh();
+        Ok(())
+    }
+
+    /// Joint angles, rad, with which the arm holds its tool centre point at a pose; for a second arm like it, in the frame
+    /// of that one's base.
+    ///
+    /// # Errors
+    /// When the arm cannot reach it.
+    pub fn joints_for(&mut self, tcp: &Pose) -> Result<[f64; JOINTS]> {
+        let (joints, error) = self.arm.solve(tcp, &self.home.joints, 200);
+        if error > 1e-3 {
+            return Err(Error::Unreachable { what: "start pose of the hand", error });
+        }
+        Ok(joints)
+    }
+
+    /// Puts the second arm of a scene of two at rest at joint angles, which it then holds.
+    ///
+    /// # Errors
+    /// When the scene has no second arm.
+    pub fn set_second_arm(&mut self, joints: &[f64; JOINTS]) -> Result<()> {
+        let missing = || Error::Missing { what: "actuator", name: "second_a1".to_owned() };
+        let actuator = self.model.name_to_id(MjtObjBase::mjOBJ_ACTUATOR, "second_a1").ok_or_else(missing)?;
+        let joint = self.model.name_to_id(MjtObjBase::mjOBJ_JOINT, "second_joint1").ok_or_else(missing)?;
+        let qpos = self.model.jnt_qposadr().get(joint).and_then(|&q| usize::try_from(q).ok());
+        let qpos = qpos.ok_or_else(missing)?;
+        self.data.qpos_mut()[qpos..qpos + JOINTS].copy_from_slice(joints);
+        self.data.ctrl_mut()[actuator..actuator + JOINTS].copy_from_slice(joints);
+        self.refresh();
+        Ok(())
+    }
+
+    fn set_gripper(&mut self, opening: f64, open: bool) {
+        self.command.open = open;
+        if self.gripper {
+            self.data.qpos_mut()[GRIP..GRIP + 2].fill(0.5 * opening);
+            self.data.ctrl_mut()[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+        }
+    }
+
+    fn set_arm(&mut self, joints: &[f64; JOINTS]) {
+        self.data.qpos_mut()[..JOINTS].copy_from_slice(joints);
+        self.data.ctrl_mut()[..JOINTS].copy_from_slice(joints);
+        self.command.goal = self.arm.pose(joints);
+        self.command.joints = *joints;
     }
 
     /// Lets the scene come to rest with the arm held where it is.
@@ -191,7 +328,22 @@ impl Sim {
         }
     }
 
-    /// The same with the gripper open.
+    /// Waits until the object is at rest, for at most so many control steps: what leans or rocks takes a while.
+    ///
+    /// # Errors
+    /// When the object is not a free body.
+    pub fn settle_object(&mut self, most: usize) -> Result<()> {
+        let (_, dof) = self.free_joint(self.object)?;
+        for _ in 0..most {
+            self.settle(1);
+            if self.data.qvel()[dof..dof + 6].iter().all(|v| v.abs() < 1e-3) {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// As [`Self::settle`], with the gripper open.
     pub(crate) fn settle_open(&mut self, control_steps: usize) {
         self.command.open = true;
         self.settle(control_steps);
@@ -243,7 +395,9 @@ impl Sim {
                 let step = joints[j] - from[j];
                 ctrl[j] = from[j] + step * (k as f64 / steps) + lead[j] * step / (steps * dt);
             }
-            ctrl[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+            if self.gripper {
+                ctrl[GRIP] = if open { FINGER_OPEN } else { FINGER_CLOSED };
+            }
             self.data.step();
         }
         self.command.joints = *joints;
@@ -277,27 +431,35 @@ impl Sim {
         state.extend([q.w, q.i, q.j, q.k]);
         state.extend(self.command.joints);
         state.push(f64::from(u8::from(self.command.open)));
+        let q = self.object_start.orientation.quaternion();
+        state.extend(self.object_start.position.iter());
+        state.extend([q.w, q.i, q.j, q.k]);
         state
     }
 
     /// Back to a state of [`Self::save`]; the numbers after it are returned.
     pub(crate) fn restore<'a>(&mut self, state: &'a [f64]) -> Result<&'a [f64]> {
         let physics = self.model.state_size(STATE);
-        let expected = physics + 7 + JOINTS + 1;
+        let expected = physics + 7 + JOINTS + 1 + 7;
         if state.len() < expected {
             return Err(Error::State { expected, found: state.len() });
         }
         let (physics, rest) = state.split_at(physics);
         self.data.set_state(physics, STATE).map_err(|e| Error::MuJoCo(e.to_string()))?;
-        let q = Quaternion::new(rest[3], rest[4], rest[5], rest[6]);
-        // Unchecked: normalising again would change the last bit of a quaternion that was saved normalised.
-        let orientation = UnitQuaternion::new_unchecked(q);
-        self.command.goal = Pose::new(Vector3::new(rest[0], rest[1], rest[2]), orientation);
+        self.command.goal = pose_from(rest);
         self.command.joints.copy_from_slice(&rest[7..7 + JOINTS]);
         self.command.open = rest[7 + JOINTS] > 0.5;
+        self.object_start = pose_from(&rest[8 + JOINTS..]);
         self.refresh();
-        Ok(&rest[8 + JOINTS..])
+        Ok(&rest[15 + JOINTS..])
     }
+}
+
+/// A pose from seven numbers. Unchecked: normalising again would change the last bit of a quaternion that was saved
+/// normalised.
+fn pose_from(row: &[f64]) -> Pose {
+    let orientation = UnitQuaternion::new_unchecked(Quaternion::new(row[3], row[4], row[5], row[6]));
+    Pose::new(Vector3::new(row[0], row[1], row[2]), orientation)
 }
 
 /// Pose of a site.

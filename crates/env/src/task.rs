@@ -1,6 +1,7 @@
-use crate::{Error, Expert, Result, Sim, TaskOptions, config::DemonstratorConfig, nut};
+use crate::tasks::ENTRIES;
+use crate::{Error, Expert, PosturePull, Result, Sim, TaskOptions, config::DemonstratorConfig};
 use e2h_core::{Direction, Pose, Rng};
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 
 /// A pair of tasks that undo each other, in one scene.
 ///
@@ -10,7 +11,9 @@ pub trait Task: Send + Sync {
     fn name(&self) -> &str;
 
     /// Name of the variant.
-    fn variant(&self) -> &str;
+    fn variant(&self) -> &str {
+        STANDARD[0]
+    }
 
     /// The scene, MJCF.
     fn scene(&self) -> String;
@@ -24,19 +27,40 @@ pub trait Task: Send + Sync {
     }
 
     /// Quaternion (wxyz) whose hemisphere the object's orientation is kept in.
-    fn object_reference(&self) -> [f64; 4];
+    fn object_reference(&self) -> [f64; 4] {
+        [1.0, 0.0, 0.0, 0.0]
+    }
 
     /// Pose of the tool centre point with the arm at home, the same for both directions.
     fn home(&self) -> Pose;
+
+    /// Whether episodes start with the arm at home and the gripper open. False where the arm never lets go: it then starts
+    /// wherever [`Self::place`] puts it, and there is no way home that would not undo the task.
+    fn homes(&self) -> bool {
+        true
+    }
+
+    /// When the inverse kinematics draws the arm towards its home posture.
+    fn posture_pull(&self) -> PosturePull {
+        PosturePull::Once
+    }
 
     /// Control steps after which an episode should time out; what configurations start from.
     fn horizon(&self, direction: Direction) -> usize;
 
     /// Draws a start of `direction` and puts the object there. The arm is at home already.
-    fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng);
+    ///
+    /// # Errors
+    /// When the arm cannot reach a start, or the scene lacks a body; a sound task never fails.
+    fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng) -> Result<()>;
 
     /// Whether the scene is in a goal state of `direction` right now.
     fn success(&self, direction: Direction, sim: &Sim) -> bool;
+
+    /// Whether the object has to be held throughout: dropping it then ends the episode.
+    fn holds(&self) -> bool {
+        false
+    }
 
     /// A demonstrator for one episode.
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert>;
@@ -45,39 +69,79 @@ pub trait Task: Send + Sync {
     fn demonstrator(&self) -> &DemonstratorConfig;
 }
 
+/// Variants of a pair that comes in one form.
+pub(crate) const STANDARD: [&str; 1] = ["standard"];
+
+/// What the registry knows of a pair.
+pub(crate) struct Entry {
+    pub(crate) name: &'static str,
+    /// The default first.
+    pub(crate) variants: &'static [&'static str],
+    /// None where there is no hole or holder.
+    pub(crate) clearance: Option<Clearance>,
+    pub(crate) build: fn(Choice) -> Arc<dyn Task>,
+}
+
+/// Free space between an object and the hole or holder that it goes into, m a side.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Clearance {
+    pub(crate) default: f64,
+    /// What the scene has room for, and what the contacts can tell from a press fit.
+    pub(crate) range: [f64; 2],
+}
+
+/// [`TaskOptions`] that were checked.
+#[derive(Debug, Clone)]
+pub(crate) struct Choice {
+    pub(crate) variant: &'static str,
+    /// m a side; 0 where the pair has none.
+    pub(crate) clearance: f64,
+    pub(crate) demonstrator: DemonstratorConfig,
+}
+
 /// Names of all task pairs.
 #[must_use]
 pub fn registry() -> &'static [&'static str] {
-    &["nut_assembly"]
+    static NAMES: LazyLock<Vec<&str>> = LazyLock::new(|| ENTRIES.iter().map(|e| e.name).collect());
+    &NAMES
 }
 
 /// Names of a task's variants, the default first; empty for an unknown task.
 #[must_use]
 pub fn variants(name: &str) -> &'static [&'static str] {
-    match name {
-        "nut_assembly" => &nut::VARIANTS,
-        _ => &[],
-    }
+    ENTRIES.iter().find(|e| e.name == name).map_or(&[], |e| e.variants)
 }
 
 /// A task by name.
 ///
 /// # Errors
-/// Unknown names and variants; the message has the nearest known one.
+/// Unknown names and variants (the message has the nearest known one), and a clearance that the scene has no room for.
 pub fn task(name: &str, options: &TaskOptions) -> Result<Arc<dyn Task>> {
-    let known = registry();
-    if !known.contains(&name) {
-        return Err(unknown("task", name, known));
-    }
-    let variants = variants(name);
+    let Some(entry) = ENTRIES.iter().find(|e| e.name == name) else {
+        return Err(unknown("task", name, registry()));
+    };
     let variant = match options.variant.as_str() {
-        "" => variants.first().copied().unwrap_or_default(),
-        given => match variants.iter().find(|v| **v == given) {
+        "" => entry.variants.first().copied().unwrap_or_default(),
+        given => match entry.variants.iter().find(|v| **v == given) {
             Some(v) => v,
-            None => return Err(unknown("variant", given, variants)),
+            None => return Err(unknown("variant", given, entry.variants)),
         },
     };
-    Ok(Arc::new(nut::NutAssembly::new(variant, options.demonstrator.clone())))
+    let clearance = clearance(entry, options.clearance)?;
+    Ok((entry.build)(Choice { variant, clearance, demonstrator: options.demonstrator.clone() }))
+}
+
+fn clearance(entry: &Entry, given: f64) -> Result<f64> {
+    let refuse = |expected| Err(Error::Clearance { task: entry.name, expected, found: given });
+    match entry.clearance {
+        Some(c) if given == 0.0 => Ok(c.default),
+        Some(c) if (c.range[0]..=c.range[1]).contains(&given) => Ok(given),
+        Some(Clearance { default, range: [low, high] }) => {
+            refuse(format!("{low} to {high} m a side, or 0 for the default of {default}"))
+        }
+        None if given == 0.0 => Ok(0.0),
+        None => refuse("0, because the pair has no hole or holder of variable size".to_owned()),
+    }
 }
 
 fn unknown(what: &'static str, name: &str, known: &[&str]) -> Error {

@@ -74,13 +74,18 @@ pub fn collect(
     let next = |lane: &mut Lane<Loop>, finished: Finished, direction: Direction| -> Result<()> {
         let Some(episode) = finished.episode else { return Ok(()) };
         let success = finished.outcome.is_success();
-        let diverged = finished.outcome == Outcome::Diverged;
+        // What only an external reset repairs.
+        let accident = match finished.outcome {
+            Outcome::Diverged => Some("diverged"),
+            Outcome::Dropped => Some("dropped"),
+            Outcome::Success { .. } | Outcome::Timeout => None,
+        };
         match direction {
             Direction::Hard => {
                 lane.state.collected.hard.push(episode);
                 lane.state.at_goal = true;
-                match (success, diverged, config.after_failure) {
-                    (_, true, _) => reset(lane, Direction::Easy, "diverged")?,
+                match (success, accident, config.after_failure) {
+                    (_, Some(cause), _) => reset(lane, Direction::Easy, cause)?,
                     (false, _, AfterFailure::Assembled) => reset(lane, Direction::Easy, "hard_failed")?,
                     _ => {
                         lane.state.at_goal = success;
@@ -103,8 +108,8 @@ pub fn collect(
                 if lane.state.cycles.is_empty() {
                     return Ok(());
                 }
-                match (success, diverged) {
-                    (_, true) => reset(lane, Direction::Hard, "diverged")?,
+                match (success, accident) {
+                    (_, Some(cause)) => reset(lane, Direction::Hard, cause)?,
                     (false, _) => reset(lane, Direction::Hard, "easy_failed")?,
                     (true, _) if config.homing => lane.env.home()?,
                     _ => {}

@@ -14,7 +14,22 @@ const PRESETS: [(&str, &str); 3] = [
     ("paper", include_str!("../../../configs/presets/paper.toml")),
 ];
 
-const TASKS: [(&str, &str); 1] = [("nut_assembly", include_str!("../../../configs/tasks/nut_assembly.toml"))];
+macro_rules! task_files {
+    ($($name:literal),*) => { [$(($name, include_str!(concat!("../../../configs/tasks/", $name, ".toml")))),*] };
+}
+
+const TASKS: [(&str, &str); 10] = task_files![
+    "cube_pick_place",
+    "cylinder_pick_place",
+    "cube_stack",
+    "rod_insertion",
+    "nut_assembly",
+    "peg_insertion",
+    "disk",
+    "mouse",
+    "test_tube",
+    "brush"
+];
 
 /// Everything that a run depends on besides its seed. Each preset file states every entry; see there for the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,6 +62,9 @@ pub struct TaskConfig {
     pub name: String,
     /// Variant of the scene.
     pub variant: String,
+    /// Free space round what goes into a hole, m a side; 0 for the task's default. Checkpoints from before it have none.
+    #[serde(default)]
+    pub clearance: f64,
     /// How human the scripted demonstrators are.
     pub demonstrator: DemonstratorConfig,
 }
@@ -55,7 +73,11 @@ impl TaskConfig {
     /// What the registry is asked with.
     #[must_use]
     pub fn options(&self) -> TaskOptions {
-        TaskOptions { variant: self.variant.clone(), demonstrator: self.demonstrator.clone() }
+        TaskOptions {
+            variant: self.variant.clone(),
+            clearance: self.clearance,
+            demonstrator: self.demonstrator.clone(),
+        }
     }
 }
 
@@ -324,6 +346,21 @@ mod tests {
             }
         }
         assert!(all.windows(2).all(|w| w[0] == w[1]), "presets differ in their keys");
+    }
+
+    #[test]
+    fn task_files_agree_with_their_tasks() {
+        assert_eq!(TASKS.map(|(name, _)| name), e2h_env::registry());
+        for (name, _) in TASKS {
+            let config = RunConfig::resolve("paper", name, &[]).unwrap().config;
+            let task = e2h_env::task(name, &config.task.options()).unwrap();
+            assert_eq!(config.refine.reverse.reference_quaternion, task.eef_reference(), "{name}");
+            // What is held throughout is neither grasped nor let go.
+            let switches = usize::from(task.homes());
+            let gate = &config.refine.gate;
+            assert_eq!((gate.closings, gate.openings), (switches, switches), "{name}");
+            assert_eq!(config.refine.suffix.enabled, !task.homes(), "{name}");
+        }
     }
 
     #[test]

@@ -4,13 +4,15 @@ mod plan;
 mod variant;
 
 use crate::expert::draw;
-use crate::{DemonstratorConfig, Expert, Sim, TableCamera, Task, compose};
+use crate::pick_place::down;
+use crate::task::{Choice, Entry};
+use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::Rng as _;
 use std::f64::consts::{PI, TAU};
-pub(crate) use variant::VARIANTS;
-use variant::{NUT_HALF_HEIGHT, PEG_TOP, Variant, Yaw};
+use std::sync::Arc;
+use variant::{NUT_HALF_HEIGHT, PEG_TOP, VARIANTS, Variant, Yaw};
 
 /// Widening of the start box in which a nut that was put down counts as taken off, m.
 ///
@@ -41,9 +43,17 @@ pub struct NutAssembly {
     demonstrator: DemonstratorConfig,
 }
 
+/// The registry's line.
+pub(crate) const ENTRY: Entry = Entry {
+    name: "nut_assembly",
+    variants: &VARIANTS,
+    clearance: None,
+    build: |c| Arc::new(NutAssembly::new(c)),
+};
+
 impl NutAssembly {
-    pub(crate) fn new(variant: &str, demonstrator: DemonstratorConfig) -> Self {
-        Self { variant: Variant::named(variant), demonstrator }
+    fn new(choice: Choice) -> Self {
+        Self { variant: Variant::named(choice.variant), demonstrator: choice.demonstrator }
     }
 
     fn in_box(&self, p: &Vector3<f64>) -> bool {
@@ -54,7 +64,7 @@ impl NutAssembly {
 
 impl Task for NutAssembly {
     fn name(&self) -> &str {
-        "nut_assembly"
+        ENTRY.name
     }
 
     fn variant(&self) -> &str {
@@ -81,14 +91,18 @@ impl Task for NutAssembly {
     }
 
     fn home(&self) -> Pose {
-        Pose::new(Vector3::from(self.variant.home), plan::down(0.0))
+        Pose::new(Vector3::from(self.variant.home), down(0.0))
+    }
+
+    fn posture_pull(&self) -> PosturePull {
+        PosturePull::Repeated // what the published policy was trained and measured with
     }
 
     fn horizon(&self, _: Direction) -> usize {
         500
     }
 
-    fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng) {
+    fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng) -> Result<()> {
         let v = self.variant;
         let (position, yaw) = match direction {
             Direction::Hard => ([draw(rng, v.start_x), draw(rng, v.start_y)], v.start_yaw(rng)),
@@ -105,7 +119,7 @@ impl Task for NutAssembly {
             }
         };
         let orientation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
-        sim.set_object(&Pose::new(Vector3::new(position[0], position[1], NUT_HALF_HEIGHT), orientation));
+        sim.set_object(&Pose::new(Vector3::new(position[0], position[1], NUT_HALF_HEIGHT), orientation))
     }
 
     fn success(&self, direction: Direction, sim: &Sim) -> bool {

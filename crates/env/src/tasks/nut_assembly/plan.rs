@@ -2,6 +2,7 @@
 
 use super::variant::{NUT_HALF_HEIGHT, PEG_TOP, Variant, Yaw};
 use crate::expert::{draw, gauss};
+use crate::pick_place::{GENTLE, down, fold, raised, yaw_of};
 use crate::{DemonstratorConfig, Phase, Script, Sim};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -15,24 +16,6 @@ const APPROACH: f64 = 0.09;
 const TRANSIT: f64 = PEG_TOP + 0.03;
 /// Gap under the nut when it is let go, m.
 const RELEASE_GAP: f64 = 0.001;
-/// Fraction of the drawn speed at which the hand goes down to things.
-const GENTLE: f64 = 0.8;
-/// Gripper pointing down, its fingers closing along y turned by `yaw`.
-pub(super) fn down(yaw: f64) -> UnitQuaternion<f64> {
-    UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
-        * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI)
-}
-
-/// Where an x axis points, rad: a nut's handle, or the back of a gripper that points down.
-fn yaw_of(orientation: &UnitQuaternion<f64>) -> f64 {
-    let x = orientation * Vector3::x();
-    x.y.atan2(x.x)
-}
-
-/// The same direction of a two-fingered gripper, within a quarter turn of straight ahead.
-fn fold(yaw: f64) -> f64 {
-    yaw - PI * (yaw / PI).round()
-}
 
 fn turned(yaw: f64, x: f64) -> Vector3<f64> {
     Vector3::new(x * yaw.cos(), x * yaw.sin(), 0.0)
@@ -74,8 +57,6 @@ pub(super) fn script(
             nut.position + turned(nut_yaw, v.grip_at) + Vector3::new(0.0, 0.0, GRASP_HEIGHT),
             down(fold(nut_yaw)),
         );
-        let raised =
-            |pose: Pose, by: f64| Pose::new(pose.position + Vector3::new(0.0, 0.0, by), pose.orientation);
         let free = |to, pace| Phase::Move { to, pace, free: true };
         let exact = |to, pace| Phase::Move { to, pace, free: false };
         let goal_yaw = match (direction, v.yaw) {

@@ -17,7 +17,7 @@ const SQUARE_PEG_HALF_WIDTH: f64 = 0.016;
 const PLAY: f64 = 0.95;
 
 /// Names of the variants, the default first.
-pub(crate) const VARIANTS: [&str; 3] = ["loose", "round", "square"];
+pub(super) const VARIANTS: [&str; 3] = ["loose", "round", "square"];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Shape {

@@ -1,0 +1,66 @@
+//! What the pairs at one table share: start regions and the pieces of their predicates.
+
+use crate::Sim;
+use crate::expert::draw;
+use e2h_core::{Pose, Rng};
+use nalgebra::{UnitQuaternion, Vector3};
+use rand::Rng as _;
+use std::f64::consts::TAU;
+
+/// How far above the object the tool centre point has to be for the arm to count as away, m.
+pub(crate) const AWAY: f64 = 0.10;
+/// Widening of a start region in which an object that was put down counts as back, m: forgives what a hand does when it
+/// lets go.
+pub(crate) const MARGIN: f64 = 0.02;
+
+/// A rectangle on the table, m in the frame of the robot's base.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Region {
+    pub(crate) x: [f64; 2],
+    pub(crate) y: [f64; 2],
+}
+
+impl Region {
+    /// A point of the region at a height.
+    pub(crate) fn draw(&self, rng: &mut Rng, height: f64) -> Vector3<f64> {
+        Vector3::new(draw(rng, self.x), draw(rng, self.y), height)
+    }
+
+    /// Whether a point is over the region or within [`MARGIN`] of it.
+    pub(crate) fn contains(&self, p: &Vector3<f64>) -> bool {
+        let within = |v: f64, [low, high]: [f64; 2]| (low - MARGIN..=high + MARGIN).contains(&v);
+        within(p.x, self.x) && within(p.y, self.y)
+    }
+}
+
+/// A point uniform in a disk.
+pub(crate) fn in_disk(rng: &mut Rng, radius: f64) -> Vector3<f64> {
+    let (r, angle) = (radius * rng.random::<f64>().sqrt(), TAU * rng.random::<f64>());
+    Vector3::new(r * angle.cos(), r * angle.sin(), 0.0)
+}
+
+/// A rotation about the vertical.
+pub(crate) fn turn(yaw: f64) -> UnitQuaternion<f64> {
+    UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
+}
+
+/// A tilt by at most `most`, rad, in any direction.
+pub(crate) fn lean(rng: &mut Rng, most: f64) -> UnitQuaternion<f64> {
+    let towards = in_disk(rng, most);
+    UnitQuaternion::new(Vector3::new(-towards.y, towards.x, 0.0))
+}
+
+/// Angle between a body's z axis and the vertical, rad.
+pub(crate) fn tilt(pose: &Pose) -> f64 {
+    (pose.orientation * Vector3::z()).z.clamp(-1.0, 1.0).acos()
+}
+
+/// Distance of two points seen from above, m.
+pub(crate) fn beside(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
+    (a.xy() - b.xy()).norm()
+}
+
+/// Whether the gripper let go of the object and the hand is well above it.
+pub(crate) fn left_alone(sim: &Sim) -> bool {
+    sim.released() && sim.tcp().position.z - sim.object().position.z > AWAY
+}

@@ -1,0 +1,43 @@
+//! Learns to insert a peg into the plate that the other arm holds from nothing but reversed demonstrations of pulling it out.
+//!
+//! ```text
+//! cargo run --release --example peg_insertion
+//! ```
+//!
+//! The paper's algorithm 1, line by line.
+
+#![allow(clippy::print_stdout, reason = "what an example is for")]
+
+mod common;
+
+use auto_e2h::learn::{Run, report};
+use std::time::Instant;
+
+fn main() -> anyhow::Result<()> {
+    let run = Run::open(&common::options("peg_insertion")?)?;
+
+    // Line 1: easy demonstrations, their reversal, and a policy from each.
+    let base = run.demonstrations()?;
+    let easy = run.train_easy(&base)?;
+    let mut hard = run.train_initial(&base)?;
+    let mut records = vec![run.evaluate(0, &hard, None)?];
+
+    // Lines 2 to 8: each policy resets the scene for the other; what the easy one does, turned round, teaches the hard one.
+    for n in 1..=run.iterations() {
+        let accepted = match run.stored(n)? {
+            Some(accepted) => accepted,
+            None => {
+                let clock = Instant::now();
+                let rollouts = run.collect(n, &hard, &easy)?;
+                run.refine(n, rollouts, clock.elapsed(), &base, &hard)?
+            }
+        };
+        hard = run.update(n, &hard, &base, &run.training_set(n, &accepted)?)?;
+        records.push(run.evaluate(n, &hard, Some(&accepted))?);
+    }
+
+    let (results, page) = run.report(&base, records)?;
+    println!("{}", report::table::iterations(&results));
+    println!("report: {}", page.display());
+    Ok(())
+}

@@ -6,15 +6,15 @@
 
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
-use anyhow::{Context, bail};
-use auto_e2h::core::stream;
+#[path = "../benches/peers/workload.rs"]
+mod workload;
+
+use anyhow::bail;
 use auto_e2h::nn::candle_core::{Device, Tensor};
-use auto_e2h::nn::{Adam, AdamConfig, Ema, EmaConfig, Mode, Weights, backward, load_weights, mse, no_grad};
-use auto_e2h::policy::{Ddim, DiffusionModel, PolicyConfig, Prediction};
-use clap::{Parser, ValueEnum};
-use rand::Rng;
+use clap::Parser;
 use std::path::PathBuf;
 use std::time::Instant;
+use workload::{Size, Workload};
 
 /// Times a training step, a forward pass and sampling.
 #[derive(Parser)]
@@ -34,100 +34,15 @@ struct Arguments {
     /// Weights and data that `train_step.py --dump` wrote.
     #[arg(long, value_name = "FILE")]
     data: Option<PathBuf>,
+    /// Also time Candle's product of two 2048 x 2048 matrices, and say what share of its rate a training step reaches.
+    #[arg(long, conflicts_with = "json")]
+    roofline: bool,
     /// Print one JSON line and nothing else.
     #[arg(long)]
     json: bool,
 }
 
-#[derive(Clone, Copy, ValueEnum)]
-enum Size {
-    /// ResNet-18 of width 16 on 64 x 64 pixels, U-Net 64, 128, 256, batch 32.
-    Laptop,
-    /// ResNet-18 of width 64 on 128 x 128 pixels, U-Net 256, 512, 1024, batch 4.
-    Paper,
-}
-
-fn config(size: Size) -> (PolicyConfig, usize) {
-    let (encoder_width, pixels, down_dims, batch) = match size {
-        Size::Laptop => (16, 64, vec![64, 128, 256], 32),
-        Size::Paper => (64, 128, vec![256, 512, 1024], 4),
-    };
-    let config = PolicyConfig {
-        n_obs_steps: 2,
-        n_image_steps: 2,
-        cameras: vec!["table".to_owned(), "wrist".to_owned()],
-        image_size: pixels,
-        crop_size: pixels,
-        share_encoder: true,
-        encoder_width,
-        encoder_blocks: vec![2, 2, 2, 2],
-        keypoints: 32,
-        image_features: 64,
-        relative_features: false,
-        down_dims,
-        kernel_size: 5,
-        n_groups: 8,
-        step_embed_dim: 128,
-        prediction: Prediction::Epsilon,
-        train_timesteps: 100,
-        inference_steps: 10,
-        ..PolicyConfig::tiny()
-    };
-    (config, batch)
-}
-
-/// What a step needs, on the host.
-struct Data {
-    images: [Tensor; 2],
-    state: Tensor,
-    actions: Vec<f32>,
-    noise: Vec<f32>,
-    timesteps: Vec<f32>,
-}
-
-/// Random data like PyTorch's.
-fn random(c: &PolicyConfig, b: usize) -> anyhow::Result<Data> {
-    let mut rng = stream(0, "peer", 0, 0);
-    let n = b * 2 * c.crop_size * c.crop_size * 3;
-    let mut image = || {
-        Tensor::from_vec(
-            (0..n).map(|_| rng.random::<f32>()).collect::<Vec<_>>(),
-            (b * 2, c.crop_size, c.crop_size, 3),
-            &Device::Cpu,
-        )
-    };
-    let images = [image()?, image()?];
-    let mut normal =
-        |n: usize| -> Vec<f32> { (0..n).map(|_| rng.sample(rand_distr::StandardNormal)).collect() };
-    let state = Tensor::from_vec(normal(b * 30), (b, 30), &Device::Cpu)?;
-    let (actions, noise) = (normal(b * 128), normal(b * 128));
-    let timesteps = (0..b).map(|i| (i * 37 % 100) as f32).collect();
-    Ok(Data { images, state, actions, noise, timesteps })
-}
-
-/// The data among dumped tensors; what is left of them are the weights.
-fn dumped(c: &PolicyConfig, all: &mut Weights) -> anyhow::Result<Data> {
-    let mut take = |name: &str| {
-        all.remove(name).with_context(|| format!("expected tensor `{name}` in the file, found none"))
-    };
-    let (images, state) = (take("images")?, take("state")?);
-    let b = state.shape[0];
-    // The file has a sample's images in the order (step, camera).
-    let one = c.crop_size * c.crop_size * 3;
-    let camera = |camera: usize| {
-        let data =
-            images.data.chunks_exact(one).skip(camera).step_by(2).flatten().copied().collect::<Vec<f32>>();
-        Tensor::from_vec(data, (b * 2, c.crop_size, c.crop_size, 3), &Device::Cpu)
-    };
-    Ok(Data {
-        images: [camera(0)?, camera(1)?],
-        state: Tensor::from_vec(state.data, (b, 30), &Device::Cpu)?,
-        actions: take("actions")?.data,
-        noise: take("noise")?.data,
-        timesteps: take("timesteps")?.data,
-    })
-}
-
+/// Milliseconds.
 fn median(repeats: usize, mut run: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
     for _ in 0..3 {
         run()?;
@@ -140,6 +55,18 @@ fn median(repeats: usize, mut run: impl FnMut() -> anyhow::Result<()>) -> anyhow
     }
     times.sort_by(f64::total_cmp);
     Ok((100.0 * times[times.len() / 2]).round() / 100.0)
+}
+
+/// Operations a second of a large matrix product.
+fn product_rate(repeats: usize) -> anyhow::Result<f64> {
+    const N: usize = 2048;
+    let a = Tensor::rand(-1f32, 1., (N, N), &Device::Cpu)?;
+    let b = Tensor::rand(-1f32, 1., (N, N), &Device::Cpu)?;
+    let ms = median(repeats, || {
+        a.matmul(&b)?;
+        Ok(())
+    })?;
+    Ok(2.0 * (N as f64).powi(3) / (1e-3 * ms))
 }
 
 /// Peak resident memory, MB; none where the system does not say.
@@ -156,87 +83,45 @@ fn main() -> anyhow::Result<()> {
     }
     auto_e2h::nn::tune_allocator();
     auto_e2h::learn::set_threads(a.threads)?;
-    let (config, batch) = config(a.size);
-    let batch = a.batch.unwrap_or(batch);
-    let model = DiffusionModel::new(&config, Mode::Train, &mut stream(0, "weights", 0, 0))?;
-    let data = match &a.data {
-        Some(file) => {
-            let (mut all, _) = load_weights(file)?;
-            let data = dumped(&config, &mut all)?;
-            model.params().import(&all)?;
-            data
-        }
-        None => random(&config, batch)?,
-    };
-    let b = data.timesteps.len();
-    let shape = (b, config.horizon, 8);
-    let ddim = Ddim::new(config.train_timesteps, config.inference_steps, config.prediction)?;
-    let mut adam = Adam::new(
-        &AdamConfig { beta1: 0.9, weight_decay: 0.0, clip_norm: Some(1.0), ..AdamConfig::default() },
-        model.params(),
-    )?;
-    // At this power the average moves by a thousandth from the second step on, as PyTorch's does.
-    let mut ema = Ema::new(&EmaConfig { power: 20.0, max: 0.999 }, model.params())?;
-    let noisy = || {
-        let mut noisy = data.actions.clone();
-        for ((x, e), t) in noisy.chunks_exact_mut(128).zip(data.noise.chunks_exact(128)).zip(&data.timesteps)
-        {
-            ddim.add_noise(x, e, *t as usize);
-        }
-        Tensor::from_vec(noisy, shape, &Device::Cpu)
-    };
-    let target = Tensor::from_slice(&data.noise, shape, &Device::Cpu)?;
-    let mut first = None;
-    let mut step = || -> anyhow::Result<()> {
-        let condition = model.condition(&data.state, &data.images)?;
-        let loss = mse(&model.forward(&noisy()?, &data.timesteps, &condition)?, &target, None)?;
-        first.get_or_insert(loss.to_scalar::<f32>()?);
-        let grads = backward(&loss, model.params())?;
-        adam.step(model.params(), &grads, 2e-4)?;
-        Ok(ema.update(model.params())?)
-    };
-    let step_ms = median(a.repeats, &mut step)?;
+    let mut work = Workload::new(a.size, a.batch, a.data.as_deref())?;
 
-    let actions = Tensor::from_slice(&data.actions, shape, &Device::Cpu)?;
-    let forward_ms = median(a.repeats, || {
-        no_grad(|| {
-            let condition = model.condition(&data.state, &data.images)?;
-            model.forward(&actions, &data.timesteps, &condition)?;
-            Ok(())
-        })
+    let mut first = None;
+    let step = median(a.repeats, || {
+        let loss = work.step()?;
+        first.get_or_insert(loss);
+        Ok(())
     })?;
-    let sample_ms = |b: usize| -> anyhow::Result<f64> {
-        let d = random(&config, b)?;
-        median(a.repeats, || {
-            let condition = no_grad(|| model.condition(&d.state, &d.images))?;
-            let mut x = d.actions.clone();
-            for s in ddim.steps() {
-                let input = Tensor::from_slice(&x, (b, config.horizon, 8), &Device::Cpu)?;
-                let output = no_grad(|| model.forward(&input, &vec![s.timestep as f32; b], &condition))?;
-                ddim.step(s, &output.flatten_all()?.to_vec1::<f32>()?, &mut x);
-            }
-            Ok(())
-        })
-    };
-    let (ddim1, ddim8) = (sample_ms(1)?, sample_ms(8)?);
-    let size = if matches!(a.size, Size::Laptop) { "laptop" } else { "paper" };
-    let (params, loss, peak) = (model.params().count(), first.unwrap_or(f32::NAN), peak_mb());
+    let forward = median(a.repeats, || work.forward())?;
+    let ddim1 = median(a.repeats, work.sampler(1)?)?;
+    let ddim8 = median(a.repeats, work.sampler(8)?)?;
+
+    let (size, batch, params) = (a.size.name(), work.batch(), work.parameters());
+    let (loss, peak) = (first.unwrap_or(f32::NAN), peak_mb());
     if a.json {
         println!(
             "{}",
             serde_json::json!({
                 "peer": concat!("auto-e2h ", env!("CARGO_PKG_VERSION")), "variant": "default", "size": size,
-                "device": "cpu", "batch": b, "threads": a.threads, "params": params, "forward": forward_ms,
-                "step": step_ms, "ddim1": ddim1, "ddim8": ddim8, "rss_mb": peak, "loss": loss,
+                "device": "cpu", "batch": batch, "threads": a.threads, "params": params, "forward": forward,
+                "step": step, "ddim1": ddim1, "ddim8": ddim8, "rss_mb": peak, "loss": loss,
             })
         );
     } else {
-        println!("{size}: {params} parameters, batch {b}, {} thread(s)", a.threads);
-        println!("  training step      {step_ms:8.2} ms   (loss of the first {loss:.6})");
-        println!("  forward            {forward_ms:8.2} ms");
+        println!("{size}: {params} parameters, batch {batch}, {} thread(s)", a.threads);
+        println!("  training step      {step:8.2} ms   (loss of the first {loss:.6})");
+        println!("  forward            {forward:8.2} ms");
         println!("  sampling, 1        {ddim1:8.2} ms");
         println!("  sampling, 8        {ddim8:8.2} ms");
         println!("  peak memory        {:8} MB", peak.unwrap_or(0));
+        if a.roofline {
+            let (product, reached) = (product_rate(a.repeats)?, work.step_flop() / (1e-3 * step));
+            println!("  matrix product     {:8.1} GFLOP/s", 1e-9 * product);
+            println!(
+                "  training step      {:8.1} GFLOP/s, {:.0} % of it",
+                1e-9 * reached,
+                100.0 * reached / product
+            );
+        }
     }
     Ok(())
 }

@@ -52,6 +52,9 @@ pub enum Error {
     /// Weight gradients were asked for through Candle's own `backward`, which has no place for them.
     #[error("weight gradients: expected a call to `e2h_nn::backward`, found Candle's `Tensor::backward`")]
     NotRecording,
+    /// A second backward pass through one forward pass.
+    #[error("backward pass: expected a new forward pass, found one whose values an earlier backward pass has freed")]
+    Freed,
     /// A file could not be read or written.
     #[error("{doing} {}: {source}", path.display())]
     Io {

@@ -157,8 +157,10 @@ impl Flow {
 
 /// A finished tape as an operation of Candle's.
 struct Whole {
-    tape: Tape,
+    /// Until a backward pass takes it: it frees each value as soon as no step left can read it.
+    tape: Mutex<Option<Tape>>,
     out: Node,
+    shape: Shape,
     /// The result, until Candle takes it.
     value: Mutex<Option<Vec<f32>>>,
     /// The inputs that Candle tracks, in the order of its arguments.
@@ -169,32 +171,35 @@ impl Whole {
     fn take(&self) -> candle_core::Result<(CpuStorage, Shape)> {
         let taken = self.value.lock().ok().and_then(|mut v| v.take());
         let Some(v) = taken else { candle_core::bail!("the result was taken before") };
-        Ok((CpuStorage::F32(v), Shape::from(self.tape.shape(self.out).to_vec())))
+        Ok((CpuStorage::F32(v), self.shape.clone()))
     }
 
     fn back(&self, result: &Tensor, dy: &Tensor) -> candle_core::Result<[Option<Tensor>; 3]> {
         let dy = dy.contiguous()?;
-        let flow = in_pool(|| self.flow(result, &dy)).map_err(candle_core::Error::wrap)?;
+        let taken = self.tape.lock().ok().and_then(|mut t| t.take());
+        let Some(mut tape) = taken else { return Err(candle_core::Error::wrap(Error::Freed)) };
+        let flow = in_pool(|| self.flow(&mut tape, result, &dy)).map_err(candle_core::Error::wrap)?;
         grad::give(flow.weights).map_err(candle_core::Error::wrap)?;
         let mut grads = flow.grads;
         let mut out = [None, None, None];
         for (o, n) in out.iter_mut().zip(&self.tracked) {
             if let Some(g) = grads[n.0].take() {
-                *o = Some(Tensor::from_vec(g, self.tape.shape(*n), &Device::Cpu)?);
+                *o = Some(Tensor::from_vec(g, tape.shape(*n), &Device::Cpu)?);
             }
         }
         Ok(out)
     }
 
-    fn flow(&self, result: &Tensor, dy: &Tensor) -> Result<Flow> {
-        let values = Values { tape: &self.tape, out: self.out, result };
-        let mut flow = Flow { grads: self.tape.slots.iter().map(|_| None).collect(), weights: Vec::new() };
+    fn flow(&self, tape: &mut Tape, result: &Tensor, dy: &Tensor) -> Result<Flow> {
+        let mut flow = Flow { grads: tape.slots.iter().map(|_| None).collect(), weights: Vec::new() };
         flow.add(self.out, read(dy)?.to_vec());
-        for (node, step) in self.tape.steps.iter().rev() {
+        while let Some((node, step)) = tape.steps.pop() {
             // A value that nothing read has no gradient.
             if let Some(dy) = flow.grads[node.0].take() {
-                step.backward(&values, dy, &mut flow)?;
+                step.backward(&Values { tape, out: self.out, result }, dy, &mut flow)?;
             }
+            // Its readers came later, so they are done.
+            tape.slots[node.0].value = Value::Gone;
         }
         Ok(flow)
     }
@@ -312,7 +317,8 @@ pub(crate) fn run(
     if arguments.is_empty() {
         arguments.extend(anchor);
     }
-    let whole = Whole { tape, out, value: Mutex::new(Some(value)), tracked };
+    let value = Mutex::new(Some(value));
+    let whole = Whole { tape: Mutex::new(Some(tape)), out, shape: Shape::from(shape), value, tracked };
     Ok(match arguments[..] {
         [a] => a.apply_op1(whole)?,
         [a, b] => a.apply_op2(b, whole)?,

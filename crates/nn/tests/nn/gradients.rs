@@ -316,6 +316,15 @@ fn shared_and_joint_networks() {
 
 /// Weight gradients have nowhere to go in Candle's own call: that is an error, not a silent loss.
 #[test]
+fn a_second_backward_pass_is_refused() {
+    let (params, net) = filled(Mode::Train, |b| Linear::new(4, 2, b));
+    let loss = loss(&net.forward(&x(1, &[3, 4])).unwrap());
+    backward(&loss, &params).unwrap();
+    let message = backward(&loss, &params).unwrap_err().to_string();
+    assert!(message.contains("an earlier backward pass has freed"), "{message}");
+}
+
+#[test]
 fn candle_backward_is_refused() {
     let (_, net) = filled(Mode::Train, |b| Linear::new(4, 4, b));
     let _ = fill(&Weights::new());

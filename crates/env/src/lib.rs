@@ -38,8 +38,8 @@ pub use env::Env;
 pub use expert::{Expert, Phase, Script};
 pub use record::{demonstrate, replay};
 pub use render::Style;
-pub use scene::{TableCamera, compose};
-pub use sim::{MAX_OPENING, SUBSTEPS, Sim};
+pub use scene::{TableCamera, compose, finer};
+pub use sim::{MAX_OPENING, Sim};
 pub use task::{Task, registry, task, variants};
 pub use tasks::*;
 

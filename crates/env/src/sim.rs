@@ -5,8 +5,6 @@ use mujoco_rs::prelude::{MjData, MjModel, MjtJoint, MjtObjBase, MjtState, MjtWar
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::sync::Arc;
 
-/// Physics steps in one control step: 20 Hz over 2 ms.
-pub const SUBSTEPS: usize = 25;
 /// Opening of the gripper with both fingers fully apart, m.
 pub const MAX_OPENING: f64 = 0.08;
 
@@ -387,9 +385,10 @@ impl Sim {
     pub(crate) fn drive_joints(&mut self, joints: &[f64; JOINTS], open: bool) {
         let from = self.command.joints;
         let lead = self.arm.lead();
-        let steps = SUBSTEPS as f64;
         let dt = self.model.opt().timestep;
-        for k in 1..=SUBSTEPS {
+        // A whole number in every scene.
+        let steps = (1.0 / (e2h_core::CONTROL_HZ * dt)).round();
+        for k in 1..=steps as usize {
             let ctrl = self.data.ctrl_mut();
             for j in 0..JOINTS {
                 let step = joints[j] - from[j];

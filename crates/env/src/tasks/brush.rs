@@ -5,7 +5,7 @@ use crate::mjcf::{Ring, feet};
 use crate::pick_place::{Stand, Turn, down, ordered, pick_place};
 use crate::tabletop::{beside, in_disk, lean, left_alone, turn};
 use crate::task::{Choice, Clearance, Entry, STANDARD};
-use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
+use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose, finer};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -133,7 +133,7 @@ impl Task for Brush {
             RADIUS + 0.008,
             RADIUS + 0.008,
         );
-        compose(&bodies, &TableCamera::default())
+        finer(&compose(&bodies, &TableCamera::default()))
     }
 
     fn object(&self) -> &str {

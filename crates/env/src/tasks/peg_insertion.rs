@@ -2,7 +2,7 @@
 
 use crate::expert::{draw, gauss};
 use crate::pick_place::{GENTLE, down};
-use crate::scene::compose_two_arms;
+use crate::scene::{compose_two_arms, finer};
 use crate::tabletop::{in_disk, lean};
 use crate::task::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task};
@@ -115,7 +115,7 @@ impl Task for PegInsertion {
         );
         let camera = TableCamera { position: [1.45, -0.35, 0.85], target: [0.42, 0.13, 0.30], fovy: 34.0 };
         let table = r#"<geom class="scenery" type="box" size=".52 .25 .025" pos=".54 .75 -.025" rgba=".70 .60 .48 1"/>"#;
-        compose_two_arms([&peg, &plate], SECOND, table, &camera)
+        finer(&compose_two_arms([&peg, &plate], SECOND, table, &camera))
     }
 
     fn object(&self) -> &str {

@@ -5,7 +5,7 @@ use crate::mjcf::Ring;
 use crate::pick_place::{GENTLE, Symmetry, carry, down, from_above, upright};
 use crate::tabletop::{Region, in_disk, lean, tilt, turn};
 use crate::task::{Choice, Clearance, Entry, STANDARD};
-use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task, compose};
+use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task, compose, finer};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -109,7 +109,7 @@ impl Task for RodInsertion {
             FLOOR / 2.0,
             FLOOR / 2.0,
         );
-        compose(&bodies, &TableCamera::default())
+        finer(&compose(&bodies, &TableCamera::default()))
     }
 
     fn object(&self) -> &str {

@@ -3,13 +3,17 @@
 use crate::config::Resolved;
 use crate::{Error, Result};
 use e2h_core::Episode;
-use e2h_data::EpisodeStore;
+use e2h_data::lerobot::{Dataset, Writer, features_of};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Layout version of a run directory.
-const FORMAT: u32 = 1;
+/// Layout version of a run directory; 2: episodes are LeRobot datasets.
+const FORMAT: u32 = 2;
+/// The robot's name in datasets.
+const ROBOT: &str = "panda";
+/// Beside the folders of a dataset: what this project knows of it.
+const NOTES: &str = "notes.json";
 
 /// What a run is; written once, compared on resume.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -140,7 +144,8 @@ impl Directory {
         })
     }
 
-    /// Writes a folder of episodes and a JSON file in it; the folder appears whole or not at all.
+    /// Writes a LeRobot dataset and a JSON file beside its folders; it appears whole or not at all. Without episodes there is only
+    /// the JSON file, for a dataset has no features then.
     pub(crate) fn put_episodes<T: Serialize>(
         &self,
         name: &str,
@@ -152,20 +157,28 @@ impl Directory {
         if beside.exists() {
             std::fs::remove_dir_all(&beside).map_err(io("removing", &beside))?;
         }
-        let store = EpisodeStore::open(&beside)?;
-        for (i, episode) in episodes.iter().enumerate() {
-            store.write(&format!("{i:05}"), episode)?;
+        if let Some(first) = episodes.first() {
+            let mut writer =
+                Writer::create(&beside, e2h_core::CONTROL_HZ, Some(ROBOT), features_of(first))?;
+            for episode in episodes {
+                writer.push_episode(episode)?;
+            }
+            writer.finish()?;
         }
-        self.put(&format!("{beside_name}/notes.json"), notes)?;
+        self.put(&format!("{beside_name}/{NOTES}"), notes)?;
         std::fs::rename(&beside, &place).map_err(io("renaming to", &place))?;
         sync(place.parent().unwrap_or(Path::new(".")))
     }
 
     /// Reads what [`Directory::put_episodes`] wrote; none when it is not there.
     pub(crate) fn get_episodes<T: DeserializeOwned>(&self, name: &str) -> Result<Option<(Vec<Episode>, T)>> {
-        let Some(notes) = self.get(&format!("{name}/notes.json"))? else { return Ok(None) };
-        let store = EpisodeStore::open(self.join(name))?;
-        let episodes = store.names()?.iter().map(|n| store.read(n)).collect::<std::result::Result<_, _>>()?;
+        let Some(notes) = self.get(&format!("{name}/{NOTES}"))? else { return Ok(None) };
+        let root = self.join(name);
+        if !root.join("meta").exists() {
+            return Ok(Some((vec![], notes)));
+        }
+        let dataset = Dataset::open(root)?;
+        let episodes = (0..dataset.len()).map(|i| dataset.read_episode(i)).collect::<std::result::Result<_, _>>()?;
         Ok(Some((episodes, notes)))
     }
 }

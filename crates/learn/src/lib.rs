@@ -29,6 +29,7 @@ pub mod config;
 mod directory;
 mod error;
 mod evaluate;
+pub mod hub;
 mod picture;
 mod progress;
 mod published;

@@ -6,16 +6,16 @@
 
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
-use auto_e2h::learn::{Filming, Progress, Published, evaluate, report};
+use auto_e2h::learn::{Filming, Progress, Published, evaluate, hub, report};
 use clap::Parser;
 use std::path::PathBuf;
 
 /// Runs a policy from fresh resets and counts successes.
 #[derive(Parser)]
 struct Arguments {
-    /// Folder with policy.json and model.safetensors.
+    /// Folder with policy.json and model.safetensors, or hf://OWNER/NAME[@revision] (feature `hub`).
     #[arg(long, value_name = "DIR")]
-    checkpoint: PathBuf,
+    checkpoint: String,
     /// Trials.
     #[arg(long, default_value_t = 50)]
     trials: usize,
@@ -41,7 +41,7 @@ fn main() -> anyhow::Result<()> {
     if let Some(n) = a.threads {
         auto_e2h::learn::set_threads(n)?;
     }
-    let published = Published::open(&a.checkpoint)?;
+    let published = Published::open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
     let parallel = published.config.evaluation.parallel.min(a.trials);
     let progress = Progress::new(a.json);
     let (policy, direction) = (&published.policy, published.direction);

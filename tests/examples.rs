@@ -5,7 +5,7 @@ fn nut_assembly_runs_from_nothing_and_its_checkpoint_evaluates() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("run");
     let output = example("nut_assembly")
-        .args(["--preset", "smoke", "--seed", "3", "--out"])
+        .args(["--preset", "smoke", "--seed", "3", "--tensorboard", "--out"])
         .arg(&out)
         .output()
         .unwrap();
@@ -19,6 +19,27 @@ fn nut_assembly_runs_from_nothing_and_its_checkpoint_evaluates() {
         "the page refers to the network"
     );
     assert!(out.join("results.json").exists());
+
+    // The log has a folder a stage: every step's loss of the first, every iteration's success of the loop.
+    let steps = |stage: &str, tag: &str| -> Vec<i64> {
+        let files = std::fs::read_dir(out.join("tensorboard").join(stage)).unwrap().flatten();
+        let events = files.flat_map(|f| auto_e2h::learn::tensorboard::read(&f.path()).unwrap());
+        let mut steps: Vec<i64> =
+            events.filter(|e| e.scalars.iter().any(|s| s.0 == tag)).map(|e| e.step).collect();
+        steps.sort_unstable();
+        steps
+    };
+    let losses = steps("train_hard_00", "train/loss");
+    assert!(!losses.is_empty() && losses.iter().zip(1..).all(|(a, b)| *a == b), "{losses:?}");
+    assert_eq!(steps("loop", "eval/success_rate")[..2], [0, 1]);
+
+    let page = dir.path().join("view.html");
+    let output = example("view").arg(&out).arg("--out").arg(&page).output().unwrap();
+    assert_success(&output);
+    let html = std::fs::read_to_string(&page).unwrap();
+    let demonstrations = std::fs::read_dir(out.join("demonstrations")).unwrap().count() - 1; // notes.json
+    assert_eq!(html.matches("data-origin=\"demonstration\"").count(), demonstrations);
+    assert!(out.join("iteration_01/reversals.json").exists());
 
     let video = dir.path().join("rollouts.png");
     let output = example("evaluate")

@@ -14,6 +14,7 @@ fn options(out: &Path) -> RunOptions {
         resume: false,
         threads: None,
         quiet: true,
+        tensorboard: false,
     }
 }
 

@@ -51,6 +51,9 @@ struct Arguments {
     /// Show no progress.
     #[arg(long)]
     quiet: bool,
+    /// Write TensorBoard event files into the run directory's tensorboard/.
+    #[arg(long)]
+    tensorboard: bool,
 }
 
 /// What the command line asks for.
@@ -75,5 +78,6 @@ pub(crate) fn options(task: &str) -> anyhow::Result<RunOptions> {
         resume: a.resume,
         threads: a.threads,
         quiet: a.quiet,
+        tensorboard: a.tensorboard,
     })
 }

@@ -114,7 +114,11 @@ impl EpisodeStore {
         if problems.is_empty() { Ok(good) } else { Err(Error::Store { problems }) }
     }
 
-    fn summary(&self, name: &str) -> Result<Summary> {
+    /// What the header of one file says, without its rows.
+    ///
+    /// # Errors
+    /// When there is no such file, or it is not the whole file of an episode.
+    pub fn summary(&self, name: &str) -> Result<Summary> {
         let path = self.path(name)?;
         let read = io("read", &path);
         let mut file = File::open(&path).map_err(&read)?;

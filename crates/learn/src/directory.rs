@@ -17,11 +17,11 @@ const NOTES: &str = "notes.json";
 
 /// What a run is; written once, compared on resume.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Identity {
+pub(crate) struct Identity {
     format: u32,
-    task: String,
-    preset: String,
-    seed: u64,
+    pub(crate) task: String,
+    pub(crate) preset: String,
+    pub(crate) seed: u64,
 }
 
 /// A run directory that is this run's own.
@@ -108,6 +108,23 @@ impl Directory {
         Ok(this)
     }
 
+    /// A run directory that is there, to be read only.
+    pub(crate) fn existing(path: &Path) -> Result<(Self, Identity)> {
+        let this = Self { path: path.to_owned() };
+        let foreign = |expected: &str, found: String| Error::Foreign {
+            path: path.to_owned(),
+            quantity: "run directory".to_owned(),
+            expected: expected.to_owned(),
+            found,
+        };
+        let identity: Identity =
+            this.get("run.json")?.ok_or_else(|| foreign("a file run.json", "none".to_owned()))?;
+        if identity.format != FORMAT {
+            return Err(foreign(&format!("layout version {FORMAT}"), identity.format.to_string()));
+        }
+        Ok((this, identity))
+    }
+
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
@@ -118,8 +135,17 @@ impl Directory {
 
     /// Writes `value` as JSON.
     pub(crate) fn put<T: Serialize>(&self, name: &str, value: &T) -> Result<()> {
+        self.put_text(name, serde_json::to_string_pretty(value))
+    }
+
+    /// Writes `value` as JSON on one line, for long lists of numbers.
+    pub(crate) fn put_compact<T: Serialize>(&self, name: &str, value: &T) -> Result<()> {
+        self.put_text(name, serde_json::to_string(value))
+    }
+
+    fn put_text(&self, name: &str, text: serde_json::Result<String>) -> Result<()> {
         let path = self.join(name);
-        let text = serde_json::to_string_pretty(value).map_err(|e| Error::Foreign {
+        let text = text.map_err(|e| Error::Foreign {
             path: path.clone(),
             quantity: "value".to_owned(),
             expected: "JSON".to_owned(),

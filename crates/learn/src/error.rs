@@ -28,6 +28,14 @@ pub enum Error {
     /// A demonstrator could not do its task.
     #[error("{0}")]
     Demonstrations(String),
+    /// The hub, or the way there, did not do what was asked; one line that says what to do.
+    #[error("{address}: {problem}")]
+    Hub {
+        /// Repository, as it was given.
+        address: String,
+        /// What is wrong.
+        problem: String,
+    },
     /// Reading or writing failed.
     #[error("{doing} {path}: {source}")]
     Io {

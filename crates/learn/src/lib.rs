@@ -14,6 +14,7 @@
 //!     resume: false,
 //!     threads: None,
 //!     quiet: false,
+//!     tensorboard: false,
 //! };
 //! let run = Run::open(&options)?;
 //! let base = run.demonstrations()?;
@@ -28,6 +29,7 @@ pub mod config;
 mod directory;
 mod error;
 mod evaluate;
+pub mod hub;
 mod picture;
 mod progress;
 mod published;
@@ -35,6 +37,8 @@ pub mod record;
 pub mod report;
 mod rollout;
 mod run;
+pub mod tensorboard;
+pub mod view;
 
 pub use collect::{Collected, collect};
 pub use config::{Resolved, RunConfig};

@@ -1,5 +1,6 @@
 //! What a run measured: the rows of the success curve and everything that is written as `results.json`.
 
+use e2h_refine::{Fate, Refined};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -70,6 +71,47 @@ impl Collection {
     pub fn automatic_reset_rate(&self) -> f64 {
         let resets: usize = self.resets.iter().filter(|(cause, _)| *cause != "start").map(|(_, n)| n).sum();
         if self.cycles == 0 { 0.0 } else { 1.0 - (resets.min(self.cycles) as f64 / self.cycles as f64) }
+    }
+}
+
+/// What the filters made of one reversed rollout, frame by frame. `iteration_NN/reversals.json` is a list of these.
+///
+/// # Shapes
+/// Every list has one entry a frame of the reversed rollout.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Reversal {
+    /// Cycle whose easy rollout was reversed.
+    pub episode: u32,
+    /// Row of the rollout that each frame comes from.
+    pub source: Vec<u32>,
+    /// What became of each frame.
+    pub fates: Vec<Fate>,
+    /// Speed of the tool centre point, m/s.
+    pub speed: Vec<f32>,
+    /// The critic's value; none at frames that an earlier stage had removed.
+    pub value: Option<Vec<Option<f32>>>,
+    /// Smoothed advantage, likewise.
+    pub advantage: Option<Vec<Option<f32>>>,
+    /// Advantage below which frames were marked for removal.
+    pub threshold: Option<f32>,
+}
+
+impl Reversal {
+    /// The account of one reversed rollout.
+    #[must_use]
+    pub fn new(reversed: &e2h_core::Episode, refined: &Refined) -> Self {
+        // JSON has no numbers that are not finite.
+        let finite =
+            |v: &Vec<f32>| v.iter().map(|&v| v.is_finite().then_some(v)).collect::<Vec<Option<f32>>>();
+        Self {
+            episode: reversed.origin.episode,
+            source: reversed.source.clone(),
+            fates: refined.fates.clone(),
+            speed: refined.speed.clone(),
+            value: refined.value.as_ref().map(finite),
+            advantage: refined.advantage.as_ref().map(finite),
+            threshold: refined.threshold.filter(|t| t.is_finite()),
+        }
     }
 }
 

@@ -9,7 +9,8 @@ use crate::collect::{Collected, collect};
 use crate::config::{Resolved, RunConfig};
 use crate::directory::{Directory, write_atomic};
 use crate::picture;
-use crate::record::Collection;
+use crate::record::{Collection, Reversal};
+use crate::tensorboard::Events;
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Episode, Kind, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
@@ -41,6 +42,8 @@ pub struct RunOptions {
     pub threads: Option<usize>,
     /// Show no progress.
     pub quiet: bool,
+    /// Write TensorBoard event files into the run directory's `tensorboard/`. Never changes a result.
+    pub tensorboard: bool,
 }
 
 /// A run in progress.
@@ -282,6 +285,10 @@ impl Run {
         if saved.exists() {
             trainer.restore(&saved)?;
         }
+        let mut events = match trainer.step_count() {
+            done if done < steps => self.events(&format!("train_{direction}_{iteration:02}"), done as u64)?,
+            _ => None,
+        };
         let bar = self.progress.bar(name, steps as u64);
         let mut recent = std::collections::VecDeque::with_capacity(100);
         let mean = |recent: &std::collections::VecDeque<f32>| {
@@ -294,7 +301,11 @@ impl Run {
             }
             recent.push_back(loss);
             let done = trainer.step_count();
+            if let Some(events) = &mut events {
+                events.scalar("train/loss", done as u64, now(), loss.into())?;
+            }
             if done % 10 == 0 {
+                events.as_mut().map_or(Ok(()), Events::flush)?;
                 bar.set(done as u64, &format!("loss {:.4}", mean(&recent)));
             }
             // Not in the last hundred steps, so that the mean loss of a resumed run is of as many steps as ever.
@@ -304,6 +315,7 @@ impl Run {
                 trainer.save(&saved)?;
             }
         }
+        events.map(Events::finish).transpose()?;
         let loss = mean(&recent);
         bar.finish(&format!("{steps} steps, loss {loss:.4}"));
         let weights = match (steps, weights) {
@@ -318,6 +330,13 @@ impl Run {
             std::fs::remove_file(&saved).map_err(crate::directory::io("removing", &saved))?;
         }
         Ok(policy)
+    }
+
+    /// An event file of one stage, which starts or goes on at `step`; none when nobody asked for them. Each stage has a folder:
+    /// TensorBoard draws folders as curves of one chart, and a stage that goes on voids only its own later steps.
+    fn events(&self, stage: &str, step: u64) -> Result<Option<Events>> {
+        let folder = self.dir.join("tensorboard").join(stage);
+        self.options.tensorboard.then(|| Events::create(&folder, now(), step)).transpose()
     }
 
     fn provenance(&self, direction: Direction, iteration: u32) -> Result<Provenance> {
@@ -445,6 +464,12 @@ impl Run {
                 report.train_loss,
                 report.validation_loss.unwrap_or(f64::NAN)
             ));
+            if let Some(mut events) = self.events(&format!("critic_{iteration:02}"), 0)? {
+                for (step, &loss) in report.losses.iter().enumerate() {
+                    events.scalar("critic/loss", step as u64 + 1, now(), loss.into())?;
+                }
+                events.finish()?;
+            }
             critic_loss = report.validation_loss.or(Some(report.train_loss));
             let values = kinematic
                 .iter()
@@ -463,6 +488,9 @@ impl Run {
             let svg = picture::filter(episode, refined, &r.kinematic)?;
             write_atomic(&self.dir.join(folder(iteration, "filter.svg")), svg.as_bytes())?;
         }
+        let reversals: Vec<Reversal> =
+            candidates.iter().zip(&refined).map(|(e, r)| Reversal::new(e, r)).collect();
+        self.dir.put_compact(&folder(iteration, "reversals.json"), &reversals)?;
         let segments: Vec<Episode> =
             refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty()).collect();
         let collection = Collection {
@@ -518,6 +546,11 @@ pub fn set_threads(threads: usize) -> Result<()> {
     }
     drop(rayon::ThreadPoolBuilder::new().num_threads(threads).build_global());
     Ok(())
+}
+
+/// Seconds since 1970, for logs alone.
+fn now() -> f64 {
+    std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
 }
 
 fn folder(iteration: u32, name: &str) -> String {

@@ -37,7 +37,7 @@ pub fn encode(height: usize, width: usize, data: &[u8]) -> Result<Vec<u8>> {
 ///
 /// # Errors
 /// When it is no PNG file or of another size; `path` and `what` say where it lay.
-pub(crate) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
+pub fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
     let bad = |found: String| file_error(path, what, format!("a PNG image of {height} x {width}"), found);
     let broken = |e: png::DecodingError| bad(e.to_string());
     let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));

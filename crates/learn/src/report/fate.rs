@@ -42,16 +42,16 @@ fn normal(name: &str) -> String {
 }
 
 /// Position of a fate among the styles; unknown names share the last.
-pub(super) fn rank(name: &str) -> usize {
+pub(crate) fn rank(name: &str) -> usize {
     let name = normal(name);
     STYLES.iter().position(|s| s.key == name).unwrap_or(STYLES.len() - 1)
 }
 
 /// How many fates are told apart.
-pub(super) const RANKS: usize = STYLES.len();
+pub(crate) const RANKS: usize = STYLES.len();
 
 /// What a legend calls the fate.
-pub(super) fn label(rank: usize) -> &'static str {
+pub(crate) fn label(rank: usize) -> &'static str {
     STYLES[rank.min(RANKS - 1)].label
 }
 
@@ -80,6 +80,42 @@ pub(super) fn patterns(prefix: &str) -> String {
     s + "</defs>"
 }
 
+/// The fate that each frame is painted with. Re-timing keeps every second or third frame of a slow run; the whole run is
+/// painted as resampled, as stripes of one frame could not be read.
+pub(crate) fn painted(fates: &[String]) -> Vec<usize> {
+    const LONGEST_GAP: usize = 2;
+    let (kept, resampled) = (rank("kept"), rank("resampled"));
+    let mut ranks: Vec<usize> = fates.iter().map(|f| rank(f)).collect();
+    let mut last = None;
+    for t in 0..ranks.len() {
+        if ranks[t] != resampled {
+            continue;
+        }
+        let gap = last.map_or(t, |l: usize| l + 1)..t;
+        if gap.len() <= LONGEST_GAP && ranks[gap.clone()].iter().all(|r| *r == kept) {
+            ranks[gap].fill(resampled);
+        }
+        last = Some(t);
+    }
+    ranks
+}
+
+/// Rules for `.f0`, `.f1`, ... that paint an element as the fate of that rank.
+pub(crate) fn css() -> String {
+    let rule = |(rank, style): (usize, &Style)| {
+        let c = style.colour;
+        let lines = |angle: i32| format!("repeating-linear-gradient({angle}deg,{c} 0 2px,{c}38 2px 6px)");
+        let paint = match style.fill {
+            Fill::Solid => c.to_owned(),
+            Fill::Forward => lines(-45),
+            Fill::Backward => lines(45),
+            Fill::Dotted => format!("radial-gradient({c} 1.4px,{c}40 1.6px) 0 0/5px 5px"),
+        };
+        format!(".f{rank}{{background:{paint}}}\n")
+    };
+    STYLES.iter().enumerate().map(rule).collect()
+}
+
 /// A prefix for [`patterns`] that depends on what is drawn and on nothing else (64-bit FNV-1a).
 pub(super) fn prefix(drawn: impl Iterator<Item = u8>) -> String {
     let hash =
@@ -89,7 +125,7 @@ pub(super) fn prefix(drawn: impl Iterator<Item = u8>) -> String {
 
 /// `120 frames: 80 kept (67%), 40 static (33%)`, in the order of the stages; names that are not known come last.
 #[must_use]
-pub(super) fn totals(fates: &BTreeMap<String, usize>) -> String {
+pub(crate) fn totals(fates: &BTreeMap<String, usize>) -> String {
     let sum: usize = fates.values().sum();
     let mut parts: Vec<(usize, &String, usize)> =
         fates.iter().map(|(name, n)| (rank(name), name, *n)).filter(|p| p.2 > 0).collect();

@@ -184,24 +184,9 @@ impl FilterPicture {
         }
     }
 
-    /// The fate that each frame is painted with. Re-timing keeps every second or third frame of a slow run; the whole
-    /// run is painted as resampled, as stripes of one frame could not be read.
+    /// The fate that each frame with a time is painted with.
     fn band_ranks(&self) -> Vec<usize> {
-        const LONGEST_GAP: usize = 2;
-        let (kept, resampled) = (fate::rank("kept"), fate::rank("resampled"));
-        let mut ranks: Vec<usize> = self.fates.iter().zip(&self.times).map(|(f, _)| fate::rank(f)).collect();
-        let mut last = None;
-        for t in 0..ranks.len() {
-            if ranks[t] != resampled {
-                continue;
-            }
-            let gap = last.map_or(t, |l: usize| l + 1)..t;
-            if gap.len() <= LONGEST_GAP && ranks[gap.clone()].iter().all(|r| *r == kept) {
-                ranks[gap].fill(resampled);
-            }
-            last = Some(t);
-        }
-        ranks
+        fate::painted(&self.fates[..self.fates.len().min(self.times.len())])
     }
 
     fn bands(&self, axes: &Axes, prefix: &str) -> String {

@@ -5,11 +5,11 @@
 
 pub mod animation;
 pub mod chart;
-mod fate;
+pub(crate) mod fate;
 pub mod filter;
 pub mod page;
-mod png_image;
-mod svg;
+pub(crate) mod png_image;
+pub(crate) mod svg;
 pub mod table;
 
 #[cfg(test)]

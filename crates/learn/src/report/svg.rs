@@ -10,14 +10,14 @@ font:13px system-ui,-apple-system,'Segoe UI',Roboto,sans-serif;font-variant-nume
 .fig .end{text-anchor:end}.fig .mid{text-anchor:middle}.fig .b{font-weight:600}</style>";
 
 /// Colour of series `i`; readable on white and on black.
-pub(super) fn colour(i: usize) -> &'static str {
+pub(crate) fn colour(i: usize) -> &'static str {
     const COLOURS: [&str; 8] =
         ["#2f7ed8", "#e07b1a", "#2a9d6f", "#c2458f", "#8a63d2", "#b08a12", "#12a0b0", "#d1495b"];
     COLOURS[i % COLOURS.len()]
 }
 
 /// Text that may stand in HTML or SVG, also inside an attribute.
-pub(super) fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
@@ -39,7 +39,7 @@ pub(super) fn px(v: f64) -> String {
 }
 
 /// Three significant digits, without trailing zeros; `–` for what is not finite.
-pub(super) fn number(v: f64) -> String {
+pub(crate) fn number(v: f64) -> String {
     if !v.is_finite() {
         return "–".to_owned();
     }
@@ -57,7 +57,7 @@ pub(super) fn number(v: f64) -> String {
 }
 
 /// A share in [0, 1] as a percentage.
-pub(super) fn percent(share: f64) -> String {
+pub(crate) fn percent(share: f64) -> String {
     if share.is_finite() { format!("{:.0}%", share * 100.0) } else { "–".to_owned() }
 }
 

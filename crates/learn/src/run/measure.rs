@@ -1,11 +1,12 @@
 //! What a run says of itself: one row of the record an iteration, and the report at the end.
 
-use super::{Accepted, AcceptedNotes, Base, Run, TrainNotes, folder};
+use super::{Accepted, AcceptedNotes, Base, Run, TrainNotes, folder, now};
 use crate::Result;
 use crate::evaluate::{Filming, evaluate};
 use crate::picture;
 use crate::record::{IterationRecord, RunResults};
 use crate::report;
+use crate::view::scalars;
 use e2h_core::{Direction, Episode, stream};
 use e2h_policy::DiffusionPolicy;
 use std::collections::BTreeMap;
@@ -24,6 +25,7 @@ impl Run {
     ) -> Result<IterationRecord> {
         let file = folder(iteration, "record.json");
         if let Some(record) = self.dir.get(&file)? {
+            self.log(&record)?;
             return Ok(record);
         }
         let c = self.config();
@@ -68,11 +70,20 @@ impl Run {
             skipped: accepted.is_some_and(|a| a.segments.is_empty()),
         };
         self.dir.put(&file, &record)?;
+        self.log(&record)?;
         self.progress.say(&format!(
             "iteration {iteration}: {} of {} trials, {:.1} minutes",
             record.evaluation.successes, record.evaluation.trials, record.minutes
         ));
         Ok(record)
+    }
+
+    /// A row of the record as TensorBoard scalars. A resumed run writes it again, which voids what it wrote before.
+    fn log(&self, record: &IterationRecord) -> Result<()> {
+        let Some(mut events) = self.events("loop", record.iteration.into())? else { return Ok(()) };
+        scalars::iteration(&mut events, record, now())?;
+        events.finish()?;
+        Ok(())
     }
 
     /// Writes `results.json` and `report.html`; returns the results and the report's path.

@@ -18,7 +18,8 @@ DEFAULTS = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
 
 
 def open_dataset(root):
-    return LeRobotDataset("local/interop", root=root)
+    # The decoder that comes with the packages; torchcodec, the default, needs FFmpeg's libraries on the machine.
+    return LeRobotDataset("local/interop", root=root, video_backend="pyav")
 
 
 def as_uint8(image):

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Do LeRobot and this project open, compare and extend each other's datasets? Opt-in: it needs Python 3.10 to 3.12 and some
+# Do LeRobot and this project open, compare and extend each other's datasets, and open each other's policies? Opt-in: it needs Python 3.10 to 3.12 and some
 # gigabytes of packages, which go into a virtual environment of its own (E2H_INTEROP_ENV, by default below target/).
 # Exit status: 0 everything holds, 1 something does not, 3 the packages could not be installed and nothing was run.
 set -euo pipefail
@@ -17,13 +17,15 @@ if ! "$python" -c 'import lerobot' 2> /dev/null; then
 fi
 
 cd "$root"
-cargo build --release --quiet --example interop --example dataset --example refine
+cargo build --release --quiet --example interop --example dataset --example refine --example lerobot_actions --example export
 programs="${CARGO_TARGET_DIR:-$root/target}/release/examples"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
 export HF_HUB_OFFLINE=1 HF_HOME="$work/hf" CUDA_VISIBLE_DEVICES="" TOKENIZERS_PARALLELISM=false
 
-lerobot() { "$python" -W ignore "$here/interop.py" "$@" 2> "$work/stderr" || { cat "$work/stderr"; exit 1; }; }
+script() { "$python" -W ignore "$here/$1" "${@:2}" 2> "$work/stderr" || { cat "$work/stderr"; exit 1; }; }
+lerobot() { script interop.py "$@"; }
+policies() { script policies.py "$@"; }
 
 echo "== a dataset written here"
 "$programs/interop" write "$work/ours"
@@ -70,5 +72,20 @@ if [ -n "$E2H_FFMPEG" ]; then
 else
     echo "NOT RUN: no ffmpeg to decode the video with"
 fi
+
+echo "== a policy trained here opens in LeRobot"
+"$programs/lerobot_actions" make "$work/policy"
+"$programs/export" --checkpoint "$work/policy" --lerobot "$work/published"
+policies ours "$programs/lerobot_actions" "$work/policy" "$work/published"
+if "$programs/export" --checkpoint "$root/checkpoints/nut_assembly" --lerobot "$work/refused" 2> "$work/stderr"; then
+    echo "a policy that LeRobot cannot express was exported"
+    exit 1
+fi
+grep -h "^Error" "$work/stderr" | tr ';' '\n'
+test ! -e "$work/refused"
+
+echo "== policies of LeRobot's open here"
+mkdir "$work/theirs-policies"
+policies theirs "$programs/lerobot_actions" "$programs/export" "$work/theirs-policies"
 
 echo "all interop checks hold"

@@ -111,13 +111,18 @@ impl Normaliser {
     /// numbers. The gripper entry stays a number between the commands 0 and 1.
     #[must_use]
     pub fn unnormalise_action(&self, action: &Action) -> Action {
-        let mut row: Action =
-            std::array::from_fn(|i| unscale(action[i], self.action_min[i], self.action_max[i]));
+        let mut row = self.unscale_action(action);
         // The prediction's own hemisphere, so that no sign flips.
         let own = [3, 4, 5, 6].map(|i| f64::from(row[i]));
         let pose = Pose::from_row(&row).to_row(&own);
         row[3..7].copy_from_slice(&pose[3..]);
         row
+    }
+
+    /// A scaled action row, back in units, with the quaternion as long as it was predicted.
+    #[must_use]
+    pub fn unscale_action(&self, action: &Action) -> Action {
+        std::array::from_fn(|i| unscale(action[i], self.action_min[i], self.action_max[i]))
     }
 
     /// All ranges in one list, for a weight file: state min, state max, action min, action max.
@@ -146,7 +151,11 @@ impl Normaliser {
         .check()
     }
 
-    fn check(self) -> Result<Self> {
+    /// The same ranges, when each is one.
+    ///
+    /// # Errors
+    /// Names the first range that is empty or not finite.
+    pub fn check(self) -> Result<Self> {
         let state = self.state_min.iter().zip(&self.state_max).enumerate().map(|r| ("state", r));
         let action = self.action_min.iter().zip(&self.action_max).enumerate().map(|r| ("action", r));
         for (column, (index, (&min, &max))) in state.chain(action) {

@@ -1,14 +1,10 @@
 //! Host-side assembly of what the network is fed: every number passes through here once.
 
-use crate::{PolicyConfig, Result};
+use crate::{ImageScaling, PolicyConfig, Result};
 use candle_core::{Device, Tensor};
 use e2h_core::{Episode, Observation, Rng, State};
 use e2h_data::Normaliser;
 use rand::Rng as _;
-
-/// Normalised entries are clamped to this: an object that rolled off the table would otherwise drive a network to where no
-/// data ever were.
-const STATE_LIMIT: f32 = 4.0;
 
 /// Top-left corner of a crop, pixels (row, column).
 pub(crate) type Corner = (usize, usize);
@@ -28,6 +24,9 @@ pub(crate) struct Host {
     images: Vec<Vec<f32>>,
     samples: usize,
     relative: bool,
+    /// Largest normalised state entry.
+    limit: f32,
+    scaling: Vec<ImageScaling>,
     side: usize,
 }
 
@@ -38,6 +37,8 @@ impl Host {
             images: vec![vec![]; if config.n_image_steps == 0 { 0 } else { config.cameras.len() }],
             samples: 0,
             relative: config.relative_features,
+            limit: if config.state_limit > 0.0 { config.state_limit } else { f32::INFINITY },
+            scaling: config.image_scaling.clone(),
             side: config.image_size,
         }
     }
@@ -51,7 +52,7 @@ impl Host {
     ) {
         let mut push = |state: &State| {
             let start = self.state.len();
-            let limit = |v: f32| v.clamp(-STATE_LIMIT, STATE_LIMIT);
+            let limit = |v: f32| v.clamp(-self.limit, self.limit);
             self.state.extend(normaliser.normalise_state(state).map(limit));
             if self.relative {
                 // In units of 10 cm: centred on zero and of the order of one, whatever the task's ranges are.
@@ -86,9 +87,13 @@ impl Host {
         // A table turns the per-pixel arithmetic into a look-up.
         let table: [f32; 256] =
             std::array::from_fn(|v| ((v as f32 / 255.0 - 0.5) * contrast + 0.5 + brightness).clamp(0.0, 1.0));
+        let first = column.len();
         for row in 0..crop {
             let start = ((corner.0 + row) * self.side + corner.1) * 3;
             column.extend(image[start..start + crop * 3].iter().map(|&v| table[usize::from(v)]));
+        }
+        if let Some(scaling) = self.scaling.get(camera) {
+            scaling.apply(&mut column[first..]);
         }
     }
 
@@ -105,6 +110,17 @@ impl Host {
             })
             .collect::<candle_core::Result<_>>()?;
         Ok((state, images))
+    }
+}
+
+impl ImageScaling {
+    /// Scales (..., 3) pixels in [0, 1].
+    pub(crate) fn apply(&self, pixels: &mut [f32]) {
+        for pixel in pixels.as_chunks_mut::<3>().0 {
+            for (v, (mean, std)) in pixel.iter_mut().zip(self.mean.iter().zip(&self.std)) {
+                *v = (*v - mean) / std;
+            }
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! A policy on disk: `policy.json` and `model.safetensors` in one folder, which stand alone.
 
+use crate::lerobot::POSITION_GRID;
 use crate::{Error, PolicyConfig, Result};
 use e2h_core::{ACTION_DIM, STATE_DIM};
 use e2h_data::Normaliser;
@@ -7,7 +8,6 @@ use e2h_nn::Weights;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::io::Write as _;
 use std::path::Path;
 
 /// Version of the checkpoint folder's layout; a reader refuses others.
@@ -65,13 +65,23 @@ impl Checkpoint {
     /// # Errors
     /// When the folder cannot be written.
     pub fn write(&self, dir: &Path, weights: &Weights) -> Result<()> {
+        self.write_with(dir, weights, &BTreeMap::new())
+    }
+
+    /// The same with metadata in the header of the weights.
+    pub(crate) fn write_with(
+        &self,
+        dir: &Path,
+        weights: &Weights,
+        metadata: &BTreeMap<String, String>,
+    ) -> Result<()> {
         let io = |doing: &'static str, path: &Path| {
             let path = path.to_owned();
             move |source| Error::Io { doing, path, source }
         };
         std::fs::create_dir_all(dir).map_err(io("creating", dir))?;
         let weights_path = dir.join(WEIGHTS_FILE);
-        e2h_nn::save_weights(&weights_path, weights, &BTreeMap::new())?;
+        e2h_nn::save_weights(&weights_path, weights, metadata)?;
         let bytes = std::fs::read(&weights_path).map_err(io("reading back", &weights_path))?;
         let file = File {
             format: CHECKPOINT_FORMAT,
@@ -82,21 +92,7 @@ impl Checkpoint {
             normaliser: self.normaliser.clone(),
             provenance: self.provenance.clone(),
         };
-        let path = dir.join(CONFIG_FILE);
-        let text = serde_json::to_string_pretty(&file)
-            .map_err(|e| Error::Checkpoint { path: path.clone(), problem: e.to_string() })?;
-        let mut beside = tempfile::NamedTempFile::new_in(dir).map_err(io("writing in", dir))?;
-        beside
-            .write_all(text.as_bytes())
-            .and_then(|()| beside.write_all(b"\n"))
-            .and_then(|()| beside.as_file().sync_all())
-            .map_err(io("writing", &path))?;
-        beside.persist(&path).map_err(|e| Error::Io {
-            doing: "renaming to",
-            path: path.clone(),
-            source: e.error,
-        })?;
-        std::fs::File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
+        write_beside(dir, CONFIG_FILE, &file)
     }
 
     /// Reads both files and checks that they belong together.
@@ -140,11 +136,22 @@ impl Checkpoint {
                 problem: format!("expected SHA-256 {}, found {found}", file.weights_sha256),
             });
         }
-        let (weights, _) = e2h_nn::load_weights(&weights_path)?;
+        let (mut weights, _) = e2h_nn::load_weights(&weights_path)?;
+        // In a folder that LeRobot opens too; computed here.
+        weights.retain(|name, _| !name.ends_with(POSITION_GRID));
         Ok((Self { config: file.config, normaliser: file.normaliser, provenance: file.provenance }, weights))
     }
 }
 
-fn hex(bytes: &[u8]) -> String {
+/// Writes a JSON file beside its place, synced and renamed.
+pub(crate) fn write_beside(dir: &Path, name: &str, value: &impl Serialize) -> Result<()> {
+    let path = dir.join(name);
+    let mut text = serde_json::to_string_pretty(value)
+        .map_err(|e| Error::Checkpoint { path: path.clone(), problem: e.to_string() })?;
+    text.push('\n');
+    Ok(e2h_data::write_atomic(&path, text.as_bytes())?)
+}
+
+pub(crate) fn hex(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }

@@ -12,6 +12,27 @@ pub enum Prediction {
     Sample,
 }
 
+/// How noise becomes actions.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SamplerKind {
+    /// Deterministic steps; few are enough (the paper's).
+    #[default]
+    Ddim,
+    /// Steps that add noise of their own (the default of LeRobot).
+    Ddpm,
+}
+
+/// Mean and standard deviation that the channels of one camera's images are brought from, in [0, 1].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageScaling {
+    /// Subtracted; red, green, blue.
+    pub mean: [f32; 3],
+    /// Divided by; red, green, blue.
+    pub std: [f32; 3],
+}
+
 /// Architecture and inference of a diffusion policy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -60,6 +81,43 @@ pub struct PolicyConfig {
     pub inference_steps: usize,
     /// Guidance weight: 1 is fully conditional sampling; others need `conditioning_dropout` in training.
     pub guidance: f32,
+    // What follows has come later: checkpoints from before say nothing of it, and those of today only where it matters.
+    /// How noise becomes actions.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub sampler: SamplerKind,
+    /// Normalised state entries are clamped to this; 0 for no limit (LeRobot has none).
+    #[serde(default = "state_limit", skip_serializing_if = "is_state_limit")]
+    pub state_limit: f32,
+    /// True scales the quaternion of every action to length 1; false leaves it as predicted (LeRobot).
+    #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
+    pub unit_quaternion: bool,
+    /// Scaling of the images, one entry a camera; none leaves them in [0, 1].
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub image_scaling: Vec<ImageScaling>,
+}
+
+/// An object that rolled off the table would otherwise drive a network to where no data ever were.
+const STATE_LIMIT: f32 = 4.0;
+
+fn state_limit() -> f32 {
+    STATE_LIMIT
+}
+
+#[allow(
+    clippy::trivially_copy_pass_by_ref,
+    clippy::float_cmp,
+    reason = "serde's signature; an exact default"
+)]
+fn is_state_limit(limit: &f32) -> bool {
+    *limit == STATE_LIMIT
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 impl PolicyConfig {
@@ -89,6 +147,10 @@ impl PolicyConfig {
             train_timesteps: 100,
             inference_steps: 4,
             guidance: 1.0,
+            sampler: SamplerKind::Ddim,
+            state_limit: STATE_LIMIT,
+            unit_quaternion: true,
+            image_scaling: vec![],
         }
     }
 
@@ -101,8 +163,12 @@ impl PolicyConfig {
     /// Width of the U-Net's global condition.
     #[must_use]
     pub fn condition_dim(&self) -> usize {
-        self.n_obs_steps * self.state_features()
-            + self.n_image_steps * self.cameras.len() * self.image_features
+        self.condition_width(self.state_features())
+    }
+
+    /// The same for states of `state` numbers.
+    pub(crate) fn condition_width(&self, state: usize) -> usize {
+        self.n_obs_steps * state + self.n_image_steps * self.cameras.len() * self.image_features
     }
 
     /// Checks that the parts fit together.
@@ -162,6 +228,25 @@ impl PolicyConfig {
             self.inference_steps > 0 && self.inference_steps <= self.train_timesteps,
             format!("inference_steps: expected 1 to {}, got {}", self.train_timesteps, self.inference_steps),
         );
+        check(
+            self.state_limit >= 0.0 && self.state_limit.is_finite(),
+            format!("state_limit: expected 0 or more, got {}", self.state_limit),
+        );
+        check(
+            self.image_scaling.is_empty() || self.image_scaling.len() == self.cameras.len(),
+            format!(
+                "image_scaling: expected one entry for each of {} cameras or none, got {}",
+                self.cameras.len(),
+                self.image_scaling.len()
+            ),
+        );
+        for scaling in &self.image_scaling {
+            check(
+                scaling.mean.iter().all(|v| v.is_finite())
+                    && scaling.std.iter().all(|&v| v > 0.0 && v.is_finite()),
+                format!("image_scaling: expected finite means and positive deviations, got {scaling:?}"),
+            );
+        }
         if !self.cameras.is_empty() {
             check(
                 self.crop_size > 0 && self.crop_size <= self.image_size,

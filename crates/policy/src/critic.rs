@@ -13,12 +13,12 @@ use rand::seq::SliceRandom as _;
 
 /// A value function on two-step visual-state input.
 pub struct Critic {
-    params: Params,
+    pub(crate) params: Params,
     condition: ConditionEncoder,
     head: Mlp,
-    normaliser: Normaliser,
+    pub(crate) normaliser: Normaliser,
     /// The policy's configuration with the critic's crop.
-    config: PolicyConfig,
+    pub(crate) config: PolicyConfig,
 }
 
 /// What training a critic ended with.
@@ -33,7 +33,7 @@ pub struct CriticReport {
 }
 
 impl Critic {
-    fn new(
+    pub(crate) fn new(
         policy: &PolicyConfig,
         critic: &CriticConfig,
         normaliser: &Normaliser,
@@ -45,7 +45,7 @@ impl Critic {
             std::iter::once(config.condition_dim()).chain(critic.hidden.iter().copied()).chain([1]).collect();
         let mut condition = None;
         let (params, head) = Params::build(mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
-            condition = Some(ConditionEncoder::new(&config, &b.pp("diffusion")));
+            condition = Some(ConditionEncoder::new(&config, config.state_features(), &b.pp("diffusion")));
             Mlp::new(&dims, critic.dropout, &b.pp("head"))
         })?;
         let condition =
@@ -108,6 +108,12 @@ impl Critic {
             }
         }
         Ok(())
+    }
+
+    /// Side of the images that it takes, pixels.
+    #[must_use]
+    pub fn image_size(&self) -> usize {
+        self.config.image_size
     }
 
     /// Value of every row of `episode`.

@@ -1,4 +1,4 @@
-//! The noise schedule and the deterministic sampler.
+//! The noise schedule and its samplers.
 //!
 //! # Source
 //! Song et al., "Denoising Diffusion Implicit Models" (arXiv 2010.02502), equation 12 with eta = 0; schedule of Nichol and
@@ -108,6 +108,34 @@ impl Ddim {
     }
 }
 
+impl Ddim {
+    /// One step of the stochastic sampler over the same sub-sequence: the mean of what the clipped clean estimate and `sample`
+    /// say of the step before, and `fresh` noise of the smaller of the two variances (none in the last step).
+    ///
+    /// # Source
+    /// Ho et al., arXiv 2006.11239, equations 6 and 7; diffusers 0.35.2 `scheduling_ddpm.py` with `fixed_small` variance and
+    /// `clip_sample`. Checked against it in `tests/lerobot.rs`.
+    pub fn stochastic_step(&self, step: DdimStep, output: &[f32], fresh: &[f32], sample: &mut [f32]) {
+        let (signal, sigma) = (step.alpha.sqrt() as f32, (1.0 - step.alpha).sqrt() as f32);
+        let alpha = step.alpha / step.alpha_previous;
+        let (beta, rest) = (1.0 - alpha, 1.0 - step.alpha);
+        let of_clean = (step.alpha_previous.sqrt() * beta / rest) as f32;
+        let of_sample = (alpha.sqrt() * (1.0 - step.alpha_previous) / rest) as f32;
+        let deviation = if step.timestep == 0 {
+            0.0
+        } else {
+            ((1.0 - step.alpha_previous) / rest * beta).max(1e-20).sqrt() as f32
+        };
+        for ((x, &out), &noise) in sample.iter_mut().zip(output).zip(fresh) {
+            let clean = match self.prediction {
+                Prediction::Epsilon => (*x - sigma * out) / signal,
+                Prediction::Sample => out,
+            };
+            *x = of_clean * clean.clamp(-1.0, 1.0) + of_sample * *x + deviation * noise;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -131,6 +159,18 @@ mod tests {
                 assert!((a - b).abs() < 1e-3, "{prediction:?} {x:?}");
             }
         }
+    }
+
+    #[test]
+    fn the_stochastic_sampler_ends_at_what_a_perfect_network_says() {
+        let clean = [0.3, -0.8, 0.0];
+        let ddim = Ddim::new(100, 100, Prediction::Sample).unwrap();
+        let mut x = [2.0, -1.0, 0.5];
+        for (k, step) in ddim.steps().enumerate() {
+            let fresh = [0.9, -1.1, 0.2].map(|v| if k % 2 == 0 { v } else { -v });
+            ddim.stochastic_step(step, &clean, &fresh, &mut x);
+        }
+        assert!(x.iter().zip(clean).all(|(a, b)| (a - b).abs() < 1e-5), "{x:?}");
     }
 
     #[test]

@@ -1,3 +1,4 @@
+use crate::lerobot::Obstacle;
 use std::path::PathBuf;
 
 /// What can go wrong with a policy, its training or its checkpoint.
@@ -40,6 +41,16 @@ pub enum Error {
         /// What was expected and what was found.
         problem: String,
     },
+    /// What LeRobot cannot express of a policy of ours, or we of one of LeRobot's; all of it.
+    #[error("{doing} {path}: {}", list(.obstacles))]
+    Lerobot {
+        /// What was being done.
+        doing: &'static str,
+        /// Folder.
+        path: PathBuf,
+        /// Every setting with what was expected and found.
+        obstacles: Vec<Obstacle>,
+    },
     /// Reading or writing failed.
     #[error("{doing} {path}: {source}")]
     Io {
@@ -59,6 +70,10 @@ pub enum Error {
     /// Windows or normaliser failed.
     #[error(transparent)]
     Dataset(#[from] e2h_data::Error),
+}
+
+fn list(obstacles: &[Obstacle]) -> String {
+    obstacles.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ")
 }
 
 impl From<Error> for e2h_core::Error {

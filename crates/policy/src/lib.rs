@@ -26,15 +26,21 @@ mod batch;
 mod checkpoint;
 mod config;
 mod critic;
+mod critic_file;
 mod ddim;
 mod error;
+pub mod lerobot;
 mod model;
 mod policy;
 mod train;
 
 pub use checkpoint::{CHECKPOINT_FORMAT, Checkpoint, Provenance};
-pub use config::{CriticConfig, PolicyConfig, Prediction, ScheduleConfig, ScheduleKind, TrainConfig};
+pub use config::{
+    CriticConfig, ImageScaling, PolicyConfig, Prediction, SamplerKind, ScheduleConfig, ScheduleKind,
+    TrainConfig,
+};
 pub use critic::{Critic, CriticReport, train_critic};
+pub use critic_file::{CRITIC_FORMAT, CriticProvenance};
 pub use ddim::{Ddim, DdimStep};
 pub use error::{Error, Result};
 pub use model::DiffusionModel;

@@ -9,10 +9,12 @@ use e2h_nn::{Builder, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderCon
 pub(crate) struct ConditionEncoder {
     encoders: Vec<RgbEncoder>,
     config: PolicyConfig,
+    /// Numbers of one state.
+    state: usize,
 }
 
 impl ConditionEncoder {
-    pub(crate) fn new(config: &PolicyConfig, builder: &Builder) -> Result<Self> {
+    pub(crate) fn new(config: &PolicyConfig, state: usize, builder: &Builder) -> Result<Self> {
         let encoder = RgbEncoderConfig {
             height: config.crop_size,
             width: config.crop_size,
@@ -30,7 +32,7 @@ impl ConditionEncoder {
             .iter()
             .map(|name| RgbEncoder::new(&encoder, &builder.pp(name)))
             .collect::<e2h_nn::Result<_>>()?;
-        Ok(Self { encoders, config: config.clone() })
+        Ok(Self { encoders, config: config.clone(), state })
     }
 
     /// The condition vector.
@@ -57,7 +59,7 @@ impl ConditionEncoder {
             .collect::<Result<Vec<_>>>()?;
         let features = Tensor::cat(&features, 2)?;
         if c.n_image_steps == c.n_obs_steps {
-            let state = state.reshape((b, c.n_obs_steps, c.state_features()))?;
+            let state = state.reshape((b, c.n_obs_steps, self.state))?;
             return Ok(Tensor::cat(&[&state, &features], 2)?.flatten_from(1)?);
         }
         // Differs: LeRobot pairs every state with images; with fewer image steps all states come first.
@@ -75,25 +77,42 @@ pub struct DiffusionModel {
     unet: ConditionalUnet1d,
 }
 
+/// Numbers of a state and of an action.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Widths {
+    pub(crate) state: usize,
+    pub(crate) action: usize,
+}
+
 impl DiffusionModel {
     /// A network with freshly drawn weights.
     ///
     /// # Errors
     /// When the configuration does not fit together.
     pub fn new(config: &PolicyConfig, mode: Mode, rng: &mut Rng) -> Result<Self> {
+        Self::of_widths(config, Widths { state: config.state_features(), action: ACTION_DIM }, mode, rng)
+    }
+
+    /// The same for states and actions of other widths.
+    pub(crate) fn of_widths(
+        config: &PolicyConfig,
+        widths: Widths,
+        mode: Mode,
+        rng: &mut Rng,
+    ) -> Result<Self> {
         config.validate()?;
         let unet = UnetConfig {
-            input_dim: ACTION_DIM,
+            input_dim: widths.action,
             down_dims: config.down_dims.clone(),
             kernel_size: config.kernel_size,
             n_groups: config.n_groups,
             step_embed_dim: config.step_embed_dim,
-            cond_dim: config.condition_dim(),
+            cond_dim: config.condition_width(widths.state),
         };
         let mut condition = None;
         let (params, unet) = Params::build(mode, rng, |b| {
             let b = b.pp("diffusion");
-            condition = Some(ConditionEncoder::new(config, &b));
+            condition = Some(ConditionEncoder::new(config, widths.state, &b));
             ConditionalUnet1d::new(&unet, &b.pp("unet"))
         })?;
         let condition = condition

@@ -1,7 +1,7 @@
 //! A trained policy: observations in, action chunks out.
 
 use crate::batch::{Host, Rows};
-use crate::{Checkpoint, Ddim, DiffusionModel, Error, PolicyConfig, Provenance, Result};
+use crate::{Checkpoint, Ddim, DiffusionModel, Error, PolicyConfig, Provenance, Result, SamplerKind};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Action, ActionChunk, Observation, Policy, Rng, stream};
 use e2h_data::Normaliser;
@@ -135,6 +135,27 @@ impl DiffusionPolicy {
                 found: rngs.len().to_string(),
             });
         }
+        let per = self.config.horizon * ACTION_DIM;
+        self.sample_with(histories, &mut |noise| {
+            for (row, rng) in noise.chunks_exact_mut(per).zip(rngs.iter_mut()) {
+                row.fill_with(|| rng.sample(rand_distr::StandardNormal));
+            }
+        })
+    }
+
+    /// Actions for each history from noise of the caller's. `noise` fills the slice that it is given: once for where sampling
+    /// begins, and with [`crate::SamplerKind::Ddpm`] once more for every step.
+    ///
+    /// # Shapes
+    /// The slice is (histories, T, 8).
+    ///
+    /// # Errors
+    /// When the observations do not fit the policy.
+    pub fn sample_with(
+        &self,
+        histories: &[Vec<&Observation>],
+        noise: &mut dyn FnMut(&mut [f32]),
+    ) -> Result<Vec<ActionChunk>> {
         if histories.is_empty() {
             return Ok(vec![]);
         }
@@ -158,40 +179,65 @@ impl DiffusionPolicy {
         }
         let (state, images) = host.tensors(c.crop_size)?;
         let condition = self.model.condition(&state, &images)?;
-        let (b, per) = (histories.len(), c.horizon * ACTION_DIM);
-        let mut x = Vec::with_capacity(b * per);
-        for rng in rngs.iter_mut() {
-            x.extend((0..per).map(|_| rng.sample::<f32, _>(rand_distr::StandardNormal)));
-        }
-        let free = (c.guidance != 1.0).then(|| condition.zeros_like()).transpose()?;
-        for step in self.ddim.steps() {
-            let timesteps = vec![step.timestep as f32; b];
-            let input = Tensor::from_slice(&x, (b, c.horizon, ACTION_DIM), &Device::Cpu)?;
-            let mut output = self.model.forward(&input, &timesteps, &condition)?;
-            if let Some(free) = &free {
-                // Source: classifier-free guidance, arXiv 2207.12598, equation 6 in the form u + w (c - u).
-                let unconditional = self.model.forward(&input, &timesteps, free)?;
-                output = (&unconditional + ((output - &unconditional)? * f64::from(c.guidance))?)?;
-            }
-            let output = output.flatten_all()?.to_vec1::<f32>()?;
-            self.ddim.step(step, &output, &mut x);
-        }
+        let x = denoise(&self.model, &self.ddim, c, ACTION_DIM, &condition, noise)?;
         let first = if c.lerobot_alignment { c.n_obs_steps - 1 } else { 0 };
-        Ok(x.chunks_exact(per)
+        Ok(x.chunks_exact(c.horizon * ACTION_DIM)
             .map(|sample| {
-                sample
-                    .chunks_exact(ACTION_DIM)
-                    .skip(first)
-                    .take(c.n_action_steps)
-                    .map(|row| {
-                        let mut action: Action = [0.0; ACTION_DIM];
-                        action.copy_from_slice(row);
-                        self.normaliser.unnormalise_action(&action)
-                    })
-                    .collect()
+                let rows = sample.as_chunks::<ACTION_DIM>().0;
+                rows.iter().skip(first).take(c.n_action_steps).map(|row| self.action(row)).collect()
             })
             .collect())
     }
+
+    /// A predicted row in units.
+    fn action(&self, row: &Action) -> Action {
+        if self.config.unit_quaternion {
+            self.normaliser.unnormalise_action(row)
+        } else {
+            self.normaliser.unscale_action(row)
+        }
+    }
+}
+
+/// From noise to normalised actions.
+///
+/// # Shapes
+/// `condition` (B, condition), result (B, T, `action_dim`) in a row.
+pub(crate) fn denoise(
+    model: &DiffusionModel,
+    ddim: &Ddim,
+    c: &PolicyConfig,
+    action_dim: usize,
+    condition: &Tensor,
+    noise: &mut dyn FnMut(&mut [f32]),
+) -> Result<Vec<f32>> {
+    let b = condition.dim(0)?;
+    let mut x = vec![0.0; b * c.horizon * action_dim];
+    noise(&mut x);
+    let mut fresh = vec![];
+    let free = (c.guidance != 1.0).then(|| condition.zeros_like()).transpose()?;
+    for step in ddim.steps() {
+        let timesteps = vec![step.timestep as f32; b];
+        let input = Tensor::from_slice(&x, (b, c.horizon, action_dim), &Device::Cpu)?;
+        let mut output = model.forward(&input, &timesteps, condition)?;
+        if let Some(free) = &free {
+            // Source: classifier-free guidance, arXiv 2207.12598, equation 6 in the form u + w (c - u).
+            let unconditional = model.forward(&input, &timesteps, free)?;
+            output = (&unconditional + ((output - &unconditional)? * f64::from(c.guidance))?)?;
+        }
+        let output = output.flatten_all()?.to_vec1::<f32>()?;
+        match c.sampler {
+            SamplerKind::Ddim => ddim.step(step, &output, &mut x),
+            SamplerKind::Ddpm => {
+                fresh.resize(x.len(), 0.0);
+                if step.timestep > 0 {
+                    noise(&mut fresh);
+                }
+                ddim.stochastic_step(step, &output, &fresh, &mut x);
+            }
+        }
+    }
+    Ok(x)
 }
 
 impl Policy for DiffusionPolicy {

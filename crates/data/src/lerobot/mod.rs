@@ -31,7 +31,7 @@ pub use episode::{
 };
 pub use episodes::{EpisodeSpan, VideoSpan};
 pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Info, VERSION};
-pub use picture::{decode as decode_png, encode as encode_png};
+pub use picture::{decode_image as decode_png, encode as encode_png};
 pub use robot::{ColumnSlice, RobotColumns, Rotation};
 pub use stats::{FeatureStats, QUANTILES, Stats};
 pub use table::{Column, Table};

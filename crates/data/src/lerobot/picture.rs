@@ -30,6 +30,15 @@ pub fn encode(height: usize, width: usize, data: &[u8]) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// The image in a PNG file of known size, as a column holds them. Grey becomes RGB, transparency is dropped.
+///
+/// # Errors
+/// When it is no PNG file or of another size; `what` says which one it is.
+pub fn decode_image(file: &[u8], height: usize, width: usize, what: &str) -> Result<e2h_core::Image> {
+    let data = decode(file, height, width, Path::new("(dataset)"), what)?;
+    Ok(e2h_core::Image { height, width, data })
+}
+
 /// The pixels of a PNG file of known size. Grey becomes RGB, transparency is dropped, 16 bits become 8.
 ///
 /// # Shapes

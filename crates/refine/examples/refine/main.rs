@@ -7,11 +7,12 @@
 //! ```
 //!
 //! Reads a LeRobotDataset v3.0, brings it to the rate of control, reverses it, cuts and re-times what stands still or is slow,
-//! and writes a LeRobotDataset with a report beside it. Needs no simulator and no network; minutes of recordings take
-//! seconds. `crates/refine/REAL_ROBOT.md` says what comes before and after.
+//! with a critic leaves out what makes too little progress, and writes a LeRobotDataset with a report beside it. Needs no
+//! simulator and no network; minutes of recordings take seconds, the training of a critic minutes. `crates/refine/REAL_ROBOT.md` says what comes before and after.
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 mod config;
+mod critic;
 mod page;
 mod picture;
 
@@ -63,6 +64,15 @@ struct Arguments {
     /// The hard task in words (by default that of the recordings).
     #[arg(long)]
     task: Option<String>,
+    /// Critic that the advantage filter asks: a folder that --train-critic made.
+    #[arg(long, value_name = "DIR", conflicts_with = "train_critic")]
+    critic: Option<PathBuf>,
+    /// Train one first, from a LeRobotDataset of hard rollouts with the same columns; it is saved in OUT/critic.
+    #[arg(long, value_name = "DIR")]
+    train_critic: Option<PathBuf>,
+    /// Column of the hard rollouts that is true where a rollout has succeeded.
+    #[arg(long, value_name = "COLUMN", default_value = "next.success")]
+    success: String,
     /// Override a value of the filters, for example kinematic.static_frames=8 (may be repeated).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -96,8 +106,16 @@ fn main() -> Result<()> {
         config.reverse.reference_quaternion = columns.first_orientation(&table, dataset.info())?;
     }
 
-    // Poses alone first: they are small, and a later stage may have to see all episodes at once (a critic's threshold does).
-    let plans = (0..dataset.len())
+    let source = critic::Source { columns: &columns, cameras: &cameras };
+    let stage = critic::open(&a, dataset.info(), &source, &config)?;
+    ensure!(
+        !a.out.join("meta/info.json").exists(),
+        "{}: expected none: a new dataset needs a folder of its own",
+        a.out.display()
+    );
+
+    // Poses alone first: they are small, and the critic's threshold is one of all episodes.
+    let mut plans = (0..dataset.len())
         .map(|i| plan(&dataset, &columns, &config, a.fps, i))
         .collect::<Result<Vec<_>>>()?;
     ensure!(
@@ -105,6 +123,11 @@ fn main() -> Result<()> {
         "no episode was accepted: {}",
         plans.iter().map(|p| p.account.verdict.to_string()).collect::<Vec<_>>().join("; ")
     );
+
+    let judge = stage.map(|s| s.judge(&a, &source, &config)).transpose()?;
+    if let Some(judge) = &judge {
+        judge.filter(&a, &dataset, &source, &config, &mut plans)?;
+    }
 
     let features = features(&a, dataset.info(), &cameras)?;
     let robot = dataset.info().robot_type.clone();
@@ -130,18 +153,18 @@ fn main() -> Result<()> {
     let info = writer.finish()?;
 
     let accounts: Vec<&Account> = plans.iter().map(|p| &p.account).collect();
-    let report = page::json(&a, &config, &accounts, &info);
+    let report = page::json(&a, &config, judge.as_ref(), &accounts, &info);
     e2h_data::write_atomic(&a.out.join("report/frames.csv"), page::csv(&plans, a.fps).as_bytes())?;
     e2h_data::write_atomic(
         &a.out.join("report/report.json"),
         serde_json::to_string_pretty(&report)?.as_bytes(),
     )?;
-    let html = page::html(&a, &config, &accounts, &info, &drawn)?;
+    let html = page::html(&a, &config, judge.as_ref(), &accounts, &info, &drawn)?;
     e2h_data::write_atomic(&a.out.join("report/report.html"), html.as_bytes())?;
     if a.json {
         println!("{report}");
     } else {
-        print!("{}", page::text(&accounts));
+        print!("{}", page::text(&accounts, judge.as_ref()));
         println!("dataset: {}", a.out.display());
         println!("report: {}", a.out.join("report/report.html").display());
     }
@@ -217,7 +240,6 @@ fn plan(
     } else {
         Verdict::Accepted
     };
-    // The critic's stage comes after this one, over all episodes: `e2h_refine::critic_filter`.
     let refined = (verdict == Verdict::Accepted)
         .then(|| kinematic_filter(&reversed, &config.kinematic.at_rate(fps), &config.reverse));
     let account =

@@ -1,6 +1,7 @@
 //! The report: what came in, what became of it and why.
 
 use crate::config::Config;
+use crate::critic::Judge;
 use crate::{Arguments, Plan};
 use anyhow::Result;
 use e2h_core::Episode;
@@ -101,6 +102,16 @@ impl Account {
             fates: refined.map(|r| r.report.clone()).unwrap_or_default(),
         }
     }
+
+    pub(crate) fn accepted(&self) -> bool {
+        self.verdict == Verdict::Accepted
+    }
+
+    /// A later stage has changed what is left.
+    pub(crate) fn refine(&mut self, refined: &Refined, hz: f64) {
+        self.after = Figures::new(&refined.segments, hz);
+        self.fates = refined.report.clone();
+    }
 }
 
 pub(crate) fn fate_name(fate: Fate) -> &'static str {
@@ -117,7 +128,7 @@ pub(crate) fn fate_name(fate: Fate) -> &'static str {
 
 /// Fate of every frame of every reversed recording.
 pub(crate) fn csv(plans: &[Plan], fps: f64) -> String {
-    let mut out = String::from("episode,frame,time_s,source_frame,speed_m_s,fate\n");
+    let mut out = String::from("episode,frame,time_s,source_frame,speed_m_s,value,advantage,fate\n");
     for plan in plans {
         for t in 0..plan.reversed.len() {
             let (speed, fate) = match &plan.refined {
@@ -126,7 +137,14 @@ pub(crate) fn csv(plans: &[Plan], fps: f64) -> String {
                 None => (String::new(), "rejected"),
             };
             let time = t as f64 / fps;
-            out += &format!("{},{t},{time:.4},{},{speed},{fate}\n", plan.episode, plan.reversed.source[t]);
+            // Empty without a critic, and where an earlier stage had removed the frame.
+            let number = |column: Option<&Vec<f32>>| {
+                column.map(|c| c[t]).filter(|v| v.is_finite()).map_or(String::new(), |v| format!("{v:.6}"))
+            };
+            let value = number(plan.refined.as_ref().and_then(|r| r.value.as_ref()));
+            let advantage = number(plan.refined.as_ref().and_then(|r| r.advantage.as_ref()));
+            let source = plan.reversed.source[t];
+            out += &format!("{},{t},{time:.4},{source},{speed},{value},{advantage},{fate}\n", plan.episode);
         }
     }
     out
@@ -157,18 +175,25 @@ fn sums(accounts: &[&Account]) -> Sums {
     }
 }
 
-pub(crate) fn json(a: &Arguments, config: &Config, accounts: &[&Account], info: &Info) -> Value {
+pub(crate) fn json(
+    a: &Arguments,
+    config: &Config,
+    judge: Option<&Judge>,
+    accounts: &[&Account],
+    info: &Info,
+) -> Value {
     let s = sums(accounts);
+    let critic = judge.map(|j| json!({"folder": j.folder, "about": j.about}));
     json!({
         "dataset": a.dataset, "out": a.out, "fps": a.fps, "config": config,
         "episodes_in": accounts.len(), "episodes_accepted": s.accepted, "episodes_out": info.total_episodes,
         "frames_out": info.total_frames, "recorded": s.recorded, "before": s.before, "after": s.after,
-        "fates": s.fates, "episodes": accounts,
+        "fates": s.fates, "critic": critic, "episodes": accounts,
     })
 }
 
 /// The same in lines for a terminal.
-pub(crate) fn text(accounts: &[&Account]) -> String {
+pub(crate) fn text(accounts: &[&Account], judge: Option<&Judge>) -> String {
     let s = sums(accounts);
     let mut out = format!(
         "{} of {} recordings accepted\n{:>10} {:>8} {:>9} {:>8} {:>10}\n",
@@ -187,6 +212,12 @@ pub(crate) fn text(accounts: &[&Account]) -> String {
     let f = &s.fates;
     out +=
         &format!("frames: {} kept, {} static, {} re-timed, of {}\n", f.kept, f.still, f.resampled, f.frames);
+    if judge.is_some() {
+        out += &format!(
+            "critic: {} without progress, {} in short remainders, {} after the goal\n",
+            f.low_advantage, f.too_short, f.after_goal
+        );
+    }
     for account in accounts.iter().filter(|a| a.verdict != Verdict::Accepted) {
         out += &format!("episode {}: {}\n", account.episode, account.verdict);
     }
@@ -197,17 +228,19 @@ pub(crate) fn text(accounts: &[&Account]) -> String {
 pub(crate) fn html(
     a: &Arguments,
     config: &Config,
+    judge: Option<&Judge>,
     accounts: &[&Account],
     info: &Info,
     pictures: &[String],
 ) -> Result<String> {
     let s = sums(accounts);
+    let critic = judge.map_or(String::new(), |j| critic_rows(j, config, a.fps, &s.fates));
     let row = |name: &str, f: &Figures| {
         format!("<tr><th>{name}<td>{}<td>{:.1}<td>{:.2}<td>{:.3}", f.frames, f.seconds, f.path_m, f.speed())
     };
     let episode = |x: &&Account| {
         format!(
-            "<tr><td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{} / {}",
+            "<tr><td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{}<td>{} / {}",
             x.episode,
             escape(&x.verdict.to_string()),
             x.recorded.frames,
@@ -215,6 +248,7 @@ pub(crate) fn html(
             x.fates.kept,
             x.fates.still,
             x.fates.resampled,
+            x.fates.low_advantage + x.fates.too_short + x.fates.after_goal,
             x.after.frames,
             x.gripper.0,
             x.gripper.1
@@ -232,11 +266,11 @@ pub(crate) fn html(
          <h2>Why frames were left out</h2><table><tr><th>fate<th>frames<th>reason\
          <tr><th>kept<td>{}<td>a row of the new dataset, with its own image\
          <tr><th>static<td>{}<td>inside a run that stood still\
-         <tr><th>re-timed<td>{}<td>inside a slow run, passed over when that was sped up\
+         <tr><th>re-timed<td>{}<td>inside a slow run, passed over when that was sped up{critic}\
          <tr><th>all<td>{}<td>frames of accepted recordings, reversed</table>\
          <p>Every frame: <code>frames.csv</code> beside this page.</p>\
          <h2>Episodes</h2><table><tr><th>episode<th>verdict<th>recorded<th>reversed<th>kept<th>static<th>re-timed\
-         <th>written<th>closes / opens{}</table><h2>Pictures</h2>{}<h2>Values</h2><pre>{}</pre>\n",
+         <th>critic<th>written<th>closes / opens{}</table><h2>Pictures</h2>{}<h2>Values</h2><pre>{}</pre>\n",
         s.accepted,
         accounts.len(),
         escape(&a.dataset.display().to_string()),
@@ -255,6 +289,33 @@ pub(crate) fn html(
         pictures.concat(),
         escape(&serde_json::to_string_pretty(config)?)
     ))
+}
+
+/// What the critic left out, and by which rule.
+fn critic_rows(judge: &Judge, config: &Config, fps: f64, fates: &RefineReport) -> String {
+    let (advantage, suffix) = (config.advantage_at(fps), config.suffix_at(fps));
+    let about = &judge.about;
+    let held = about.validation_loss.map_or("none held out".to_owned(), |v| format!("{v:.4} held out"));
+    format!(
+        "<tr><th>low advantage<td>{}<td>the critic saw too little progress: among the lowest {} % of all frames, in a run of \
+         {} or more\
+         <tr><th>too short<td>{}<td>in a remainder of fewer than {} frames between two of those\
+         <tr><th>after the goal<td>{}<td>after the value had stayed at {} for {} frames{}\
+         <tr><th>critic<td><td>{}: {} hard rollouts, {} successful; mean squared error {:.4} in training, {held}",
+        fates.low_advantage,
+        advantage.percentile,
+        advantage.min_run,
+        fates.too_short,
+        advantage.min_run,
+        fates.after_goal,
+        suffix.value,
+        suffix.frames,
+        if suffix.enabled { "" } else { " (off)" },
+        escape(&judge.folder.display().to_string()),
+        about.rollouts,
+        about.successes,
+        about.train_loss
+    )
 }
 
 pub(crate) fn escape(text: &str) -> String {

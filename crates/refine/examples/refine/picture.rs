@@ -5,12 +5,14 @@ use crate::config::Config;
 use crate::page::{escape, fate_name};
 use e2h_core::Episode;
 use e2h_data::lerobot::Table;
-use e2h_refine::Fate;
+use e2h_refine::{Fate, Refined};
 
 const WIDTH: f64 = 960.0;
 const LEFT: f64 = 60.0;
 const PLOT: f64 = WIDTH - LEFT - 110.0;
 const HEIGHT: f64 = 150.0;
+/// Of the plot of the advantage.
+const LOWER: f64 = 80.0;
 const IMAGES: usize = 8;
 
 fn colour(fate: Option<Fate>) -> &'static str {
@@ -18,6 +20,9 @@ fn colour(fate: Option<Fate>) -> &'static str {
         Some(Fate::Kept) => "#9fd8b0",
         Some(Fate::Static) => "#c3c9d0",
         Some(Fate::Resampled) => "#a9cbf3",
+        Some(Fate::LowAdvantage) => "#f6c98b",
+        Some(Fate::TooShort) => "#efe3a8",
+        Some(Fate::AfterGoal) => "#d3bfe8",
         _ => "#f0b3b3",
     }
 }
@@ -75,10 +80,19 @@ pub(crate) fn svg(plan: &Plan, recording: &Table, camera: Option<&str>, config: 
         "<text x=\"4\" y=\"{:.1}\">{highest:.2} m/s</text><text x=\"4\" y=\"{bottom:.1}\">0</text>",
         top + 10.0
     );
-    let counts = [Fate::Kept, Fate::Static, Fate::Resampled].map(|f| {
-        let n = plan.refined.as_ref().map_or(0, |r| r.report.count(f));
-        format!("{n} {}", fate_name(f))
-    });
+    let lower = plan.refined.as_ref().and_then(|r| advantage(r, &x, bottom + 24.0));
+    let bottom = bottom + lower.as_ref().map_or(0.0, |_| LOWER + 30.0);
+    s += &lower.unwrap_or_default();
+    let all =
+        [Fate::Kept, Fate::Static, Fate::Resampled, Fate::LowAdvantage, Fate::TooShort, Fate::AfterGoal];
+    let counts: Vec<String> = all
+        .into_iter()
+        .enumerate()
+        .map(|(i, f)| (i, f, plan.refined.as_ref().map_or(0, |r| r.report.count(f))))
+        // The critic's fates where it has spoken.
+        .filter(|&(i, _, n)| i < 3 || n > 0)
+        .map(|(_, f, n)| format!("{n} {}", fate_name(f)))
+        .collect();
     let what = match &plan.refined {
         Some(_) => format!("{rows} frames: {}", counts.join(", ")),
         None => format!("{rows} frames, {}", plan.account.verdict),
@@ -94,6 +108,37 @@ pub(crate) fn svg(plan: &Plan, recording: &Table, camera: Option<&str>, config: 
          font-size=\"12\">{s}</svg>",
         bottom + 48.0
     )
+}
+
+/// The smoothed advantage below the speed, with the threshold of the filter; none without a critic.
+fn advantage(refined: &Refined, x: &impl Fn(f64) -> f64, top: f64) -> Option<String> {
+    let (values, threshold) = (refined.advantage.as_ref()?, f64::from(refined.threshold?));
+    let points: Vec<(usize, f64)> =
+        values.iter().enumerate().filter(|(_, v)| v.is_finite()).map(|(t, &v)| (t, f64::from(v))).collect();
+    let (low, high) = points
+        .iter()
+        .fold((threshold - 1e-6, threshold + 1e-6), |(low, high), &(_, v)| (low.min(v), high.max(v)));
+    let y = |v: f64| top + LOWER * (high - v) / (high - low);
+    let mut s = String::new();
+    // A line for each stretch that the critic has seen.
+    for run in points.chunk_by(|a, b| a.0 + 1 == b.0) {
+        let line: Vec<String> =
+            run.iter().map(|&(t, v)| format!("{:.1},{:.1}", x(t as f64 + 0.5), y(v))).collect();
+        s += &format!(
+            "<polyline points=\"{}\" fill=\"none\" stroke=\"#8a4bb8\" stroke-width=\"1.6\"/>",
+            line.join(" ")
+        );
+    }
+    let line = y(threshold);
+    s += &format!(
+        "<path d=\"M{LEFT} {line:.1}H{:.1}\" stroke=\"#d64545\" stroke-dasharray=\"5 4\"/>\
+         <text x=\"{:.1}\" y=\"{:.1}\">threshold</text><text x=\"4\" y=\"{:.1}\">advantage</text>",
+        LEFT + PLOT,
+        LEFT + PLOT + 6.0,
+        line + 4.0,
+        top + 10.0
+    );
+    Some(s)
 }
 
 /// Speed of the step ahead, m/s; the last row has that of the step before.

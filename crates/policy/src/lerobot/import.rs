@@ -1,0 +1,196 @@
+//! A folder of LeRobot's as a policy.
+
+use super::description::{BACKBONE_WIDTH, BACKBONES, Description, Feature, GROUPS, Obstacle};
+use super::export::{HEADER, Header};
+use super::policy::LerobotPolicy;
+use super::processors::{POSTPROCESSOR, PREPROCESSOR, Statistics};
+use super::{ACTION, CONFIG_FILE, ENVIRONMENT, POSITION_GRID, STATE, WEIGHTS_FILE};
+use crate::model::{DiffusionModel, Widths};
+use crate::{Ddim, Error, ImageScaling, PolicyConfig, Prediction, Result, SamplerKind};
+use e2h_core::stream;
+use e2h_nn::Mode;
+use std::path::Path;
+
+/// Opens a diffusion policy that LeRobot 0.4.4 or [`super::export`] wrote.
+///
+/// # Errors
+/// When a file is missing or is not what it should be; [`Error::Lerobot`] lists everything in it that this version does not
+/// compute; weights that are not those of the architecture are listed by name.
+pub fn import(dir: &Path) -> Result<LerobotPolicy> {
+    let path = dir.join(CONFIG_FILE);
+    let bytes = std::fs::read(&path).map_err(|source| Error::Io {
+        doing: "reading LeRobot checkpoint",
+        path: path.clone(),
+        source,
+    })?;
+    let d: Description = serde_json::from_slice(&bytes)
+        .map_err(|e| Error::Checkpoint { path: path.clone(), problem: e.to_string() })?;
+    let mut problems = vec![];
+    let features = Features::of(&d, &mut problems);
+    let config = network(&d, &features, &mut problems);
+    if d.kind != "diffusion" {
+        // Nothing else of another kind of policy means what it means here.
+        problems = vec![Obstacle::new("type", "diffusion", &d.kind)];
+    }
+    let refuse =
+        |obstacles| Error::Lerobot { doing: "reading LeRobot checkpoint", path: dir.to_owned(), obstacles };
+    if !problems.is_empty() {
+        return Err(refuse(problems));
+    }
+
+    let before = Statistics::read(dir, PREPROCESSOR, &mut problems)?;
+    let after = Statistics::read(dir, POSTPROCESSOR, &mut problems)?;
+    let (s, e, a) = (features.state, features.environment, features.action);
+    let state = before.scaling(STATE, "STATE", s, &mut problems);
+    let environment = before.scaling(ENVIRONMENT, "ENV", e, &mut problems);
+    let action = after.scaling(ACTION, "ACTION", a, &mut problems);
+    let mut cameras = vec![];
+    for name in &features.cameras {
+        let scaling = before.scaling(name, "VISUAL", 3, &mut problems);
+        let moments = [0, 1, 2].map(|i| scaling.moments(i));
+        cameras.push((name.clone(), ImageScaling { mean: moments.map(|m| m.0), std: moments.map(|m| m.1) }));
+    }
+    if !problems.is_empty() {
+        return Err(refuse(problems));
+    }
+
+    let widths = Widths { state: s + e, action: a };
+    let model = DiffusionModel::of_widths(&config, widths, Mode::Infer, &mut stream(0, "weights", 0, 0))?;
+    let weights_path = dir.join(WEIGHTS_FILE);
+    let (mut weights, metadata) = e2h_nn::load_weights(&weights_path)?;
+    weights.retain(|name, _| !name.ends_with(POSITION_GRID));
+    model
+        .params
+        .import(&weights)
+        .map_err(|e| Error::Checkpoint { path: weights_path, problem: e.to_string() })?;
+    let header = metadata.get(HEADER).and_then(|text| serde_json::from_str::<Header>(text).ok());
+    Ok(LerobotPolicy {
+        path: dir.to_owned(),
+        model,
+        ddim: Ddim::new(config.train_timesteps, config.inference_steps, config.prediction)?,
+        config,
+        state: (s, state),
+        environment: (e, environment),
+        action: (a, action),
+        cameras,
+        size: features.size,
+        crop: features.crop,
+        provenance: header.map(|h| h.provenance),
+    })
+}
+
+/// What goes in and comes out.
+struct Features {
+    state: usize,
+    environment: usize,
+    action: usize,
+    cameras: Vec<String>,
+    size: [usize; 2],
+    crop: [usize; 2],
+}
+
+impl Features {
+    fn of(d: &Description, problems: &mut Vec<Obstacle>) -> Self {
+        let mut vector = |all: &[(String, Feature)], name: &str, needed: bool| match all
+            .iter()
+            .find(|(n, _)| n == name)
+            .map(|(_, f)| &f.shape[..])
+        {
+            Some(&[n]) if n > 0 => n,
+            None if !needed => 0,
+            found => {
+                problems.push(Obstacle::new(name, "a vector", format!("{found:?}")));
+                0
+            }
+        };
+        let (inputs, outputs) = (&d.input_features.0, &d.output_features.0);
+        let state = vector(inputs, STATE, true);
+        let environment = vector(inputs, ENVIRONMENT, false);
+        let action = vector(outputs, ACTION, true);
+        let images: Vec<&(String, Feature)> = inputs.iter().filter(|(_, f)| f.kind == "VISUAL").collect();
+        let mut size = [0; 2];
+        for (name, feature) in &images {
+            match feature.shape[..] {
+                [3, h, w] if size == [0; 2] || size == [h, w] => size = [h, w],
+                _ => problems.push(Obstacle::new(
+                    name,
+                    "3 channels and the same size in all cameras",
+                    format!("{:?}", feature.shape),
+                )),
+            }
+        }
+        let crop = d.crop_shape.unwrap_or(size);
+        if !images.is_empty() && (crop[0] > size[0] || crop[1] > size[1]) {
+            problems.push(Obstacle::new("crop_shape", format!("at most {size:?}"), format!("{crop:?}")));
+        }
+        if !images.is_empty() && environment > 0 {
+            problems.push(Obstacle::new(
+                ENVIRONMENT,
+                "none beside images",
+                format!("{environment} numbers and {} cameras", images.len()),
+            ));
+        }
+        let cameras = images.iter().map(|(n, _)| n.clone()).collect();
+        Self { state, environment, action, cameras, size, crop }
+    }
+}
+
+/// The network in our words.
+fn network(d: &Description, features: &Features, problems: &mut Vec<Obstacle>) -> PolicyConfig {
+    let mut ask = |ok: bool, setting: &str, expected: &str, found: String| {
+        if !ok {
+            problems.push(Obstacle::new(setting, expected, found));
+        }
+    };
+    let blocks = BACKBONES.iter().find(|(name, _)| *name == d.vision_backbone).map(|(_, blocks)| *blocks);
+    if !features.cameras.is_empty() {
+        let names = BACKBONES.map(|b| b.0).join(" or ");
+        ask(blocks.is_some(), "vision_backbone", &names, d.vision_backbone.clone());
+        ask(d.use_group_norm, "use_group_norm", "true", "false".to_owned());
+        ask(d.resize_shape.is_none(), "resize_shape", "null", format!("{:?}", d.resize_shape));
+    }
+    ask(d.n_groups == GROUPS, "n_groups", &GROUPS.to_string(), d.n_groups.to_string());
+    ask(d.use_film_scale_modulation, "use_film_scale_modulation", "true", "false".to_owned());
+    let schedule = "squaredcos_cap_v2";
+    ask(d.beta_schedule == schedule, "beta_schedule", schedule, d.beta_schedule.clone());
+    #[allow(clippy::float_cmp, reason = "any other limit clips elsewhere")]
+    let clipped = d.clip_sample && d.clip_sample_range == 1.0;
+    let found = format!("{} and {}", d.clip_sample, d.clip_sample_range);
+    ask(clipped, "clip_sample and clip_sample_range", "true and 1", found);
+    let (kind, predicts) = (d.noise_scheduler_type.as_str(), d.prediction_type.as_str());
+    ask(["DDIM", "DDPM"].contains(&kind), "noise_scheduler_type", "DDIM or DDPM", kind.to_owned());
+    ask(
+        ["epsilon", "sample"].contains(&predicts),
+        "prediction_type",
+        "epsilon or sample",
+        predicts.to_owned(),
+    );
+    PolicyConfig {
+        n_obs_steps: d.n_obs_steps,
+        n_image_steps: d.n_obs_steps,
+        horizon: d.horizon,
+        n_action_steps: d.n_action_steps,
+        lerobot_alignment: true,
+        cameras: features.cameras.clone(),
+        image_size: features.crop[0],
+        crop_size: features.crop[0],
+        share_encoder: !d.use_separate_rgb_encoder_per_camera,
+        encoder_width: BACKBONE_WIDTH,
+        encoder_blocks: blocks.unwrap_or([2; 4]).to_vec(),
+        keypoints: d.spatial_softmax_num_keypoints,
+        image_features: 2 * d.spatial_softmax_num_keypoints,
+        relative_features: false,
+        down_dims: d.down_dims.clone(),
+        kernel_size: d.kernel_size,
+        n_groups: d.n_groups,
+        step_embed_dim: d.diffusion_step_embed_dim,
+        prediction: if predicts == "sample" { Prediction::Sample } else { Prediction::Epsilon },
+        train_timesteps: d.num_train_timesteps,
+        inference_steps: d.num_inference_steps.unwrap_or(d.num_train_timesteps),
+        guidance: 1.0,
+        sampler: if kind == "DDPM" { SamplerKind::Ddpm } else { SamplerKind::Ddim },
+        state_limit: 0.0,
+        unit_quaternion: false,
+        image_scaling: vec![],
+    }
+}

@@ -1,9 +1,9 @@
 //! Encoders, condition and U-Net: the network behind a policy.
 
 use crate::{PolicyConfig, Result};
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Rng};
-use e2h_nn::{Builder, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig};
+use e2h_nn::{Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig};
 
 /// Turns images and states into one vector an observation history.
 pub(crate) struct ConditionEncoder {
@@ -76,11 +76,19 @@ pub struct DiffusionModel {
 }
 
 impl DiffusionModel {
-    /// A network with freshly drawn weights.
+    /// A network with freshly drawn weights, on the CPU.
     ///
     /// # Errors
     /// When the configuration does not fit together.
     pub fn new(config: &PolicyConfig, mode: Mode, rng: &mut Rng) -> Result<Self> {
+        Self::new_on(&Compute::cpu(), config, mode, rng)
+    }
+
+    /// A network with freshly drawn weights, the same on every device.
+    ///
+    /// # Errors
+    /// When the configuration does not fit together, or the device fails.
+    pub fn new_on(compute: &Compute, config: &PolicyConfig, mode: Mode, rng: &mut Rng) -> Result<Self> {
         config.validate()?;
         let unet = UnetConfig {
             input_dim: ACTION_DIM,
@@ -91,7 +99,7 @@ impl DiffusionModel {
             cond_dim: config.condition_dim(),
         };
         let mut condition = None;
-        let (params, unet) = Params::build(mode, rng, |b| {
+        let (params, unet) = Params::build_on(compute, mode, rng, |b| {
             let b = b.pp("diffusion");
             condition = Some(ConditionEncoder::new(config, &b));
             ConditionalUnet1d::new(&unet, &b.pp("unet"))
@@ -105,6 +113,12 @@ impl DiffusionModel {
     #[must_use]
     pub fn params(&self) -> &Params {
         &self.params
+    }
+
+    /// Where its inputs have to be.
+    #[must_use]
+    pub fn device(&self) -> &Device {
+        self.params.compute().device()
     }
 
     /// The condition vector of observation histories.

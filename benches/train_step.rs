@@ -9,13 +9,14 @@
 #[path = "peers/workload.rs"]
 mod workload;
 
+use auto_e2h::nn::Compute;
 use criterion::{Criterion, criterion_group, criterion_main};
 use workload::{Size, Workload};
 
 fn train_step(c: &mut Criterion) {
     auto_e2h::nn::tune_allocator();
     for size in [Size::Laptop, Size::Paper] {
-        let mut work = Workload::new(size, None, None).expect("a network");
+        let mut work = Workload::new(size, None, None, &Compute::cpu()).expect("a network");
         let mut group = c.benchmark_group(size.name());
         group.sample_size(10);
         group.bench_function("step", |b| b.iter(|| work.step().expect("a step")));

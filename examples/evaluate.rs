@@ -7,6 +7,7 @@
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use auto_e2h::learn::{Filming, Progress, Published, evaluate, hub, report};
+use auto_e2h::nn::Compute;
 use clap::Parser;
 use std::path::PathBuf;
 
@@ -31,6 +32,9 @@ struct Arguments {
     /// Trials in the animation.
     #[arg(long, default_value_t = 6)]
     filmed: usize,
+    /// Where the policy is computed: cpu, cuda or cuda:N.
+    #[arg(long, default_value = "cpu")]
+    device: String,
     /// Threads (by default one a core); never changes a result.
     #[arg(long)]
     threads: Option<usize>,
@@ -41,7 +45,9 @@ fn main() -> anyhow::Result<()> {
     if let Some(n) = a.threads {
         auto_e2h::learn::set_threads(n)?;
     }
-    let published = Published::open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
+    let mut published = Published::open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
+    let compute = Compute::open(&a.device, published.config.device)?;
+    published.policy = published.policy.on(&compute)?;
     let parallel = published.config.evaluation.parallel.min(a.trials);
     let progress = Progress::new(a.json);
     let (policy, direction) = (&published.policy, published.direction);

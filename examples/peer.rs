@@ -10,7 +10,8 @@
 mod workload;
 
 use anyhow::bail;
-use auto_e2h::nn::candle_core::{Device, Tensor};
+use auto_e2h::nn::candle_core::Tensor;
+use auto_e2h::nn::{Compute, Precision, candle_operations};
 use clap::Parser;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -34,6 +35,18 @@ struct Arguments {
     /// Weights and data that `train_step.py --dump` wrote.
     #[arg(long, value_name = "FILE")]
     data: Option<PathBuf>,
+    /// Where the networks are computed: cpu, cuda or cuda:N.
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Products of f32 on tensor cores.
+    #[arg(long)]
+    tf32: bool,
+    /// Factors of products in bf16.
+    #[arg(long)]
+    bf16: bool,
+    /// Compute with Candle's operations, as on a GPU, whatever the device.
+    #[arg(long)]
+    candle: bool,
     /// Also time Candle's product of two 2048 x 2048 matrices, and say what share of its rate a training step reaches.
     #[arg(long, conflicts_with = "json")]
     roofline: bool,
@@ -42,15 +55,21 @@ struct Arguments {
     json: bool,
 }
 
-/// Milliseconds.
-fn median(repeats: usize, mut run: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
+/// Milliseconds, with what the device still has to do after a run.
+fn median(
+    repeats: usize,
+    compute: &Compute,
+    mut run: impl FnMut() -> anyhow::Result<()>,
+) -> anyhow::Result<f64> {
     for _ in 0..3 {
         run()?;
     }
+    compute.synchronize()?;
     let mut times = Vec::with_capacity(repeats);
     for _ in 0..repeats {
         let start = Instant::now();
         run()?;
+        compute.synchronize()?;
         times.push(1e3 * start.elapsed().as_secs_f64());
     }
     times.sort_by(f64::total_cmp);
@@ -58,11 +77,11 @@ fn median(repeats: usize, mut run: impl FnMut() -> anyhow::Result<()>) -> anyhow
 }
 
 /// Operations a second of a large matrix product.
-fn product_rate(repeats: usize) -> anyhow::Result<f64> {
+fn product_rate(repeats: usize, compute: &Compute) -> anyhow::Result<f64> {
     const N: usize = 2048;
-    let a = Tensor::rand(-1f32, 1., (N, N), &Device::Cpu)?;
-    let b = Tensor::rand(-1f32, 1., (N, N), &Device::Cpu)?;
-    let ms = median(repeats, || {
+    let a = Tensor::rand(-1f32, 1., (N, N), compute.device())?;
+    let b = Tensor::rand(-1f32, 1., (N, N), compute.device())?;
+    let ms = median(repeats, compute, || {
         a.matmul(&b)?;
         Ok(())
     })?;
@@ -78,22 +97,27 @@ fn peak_mb() -> Option<u64> {
 
 fn main() -> anyhow::Result<()> {
     let a = Arguments::parse();
+    if a.candle { candle_operations(|| measure(&a)) } else { measure(&a) }
+}
+
+fn measure(a: &Arguments) -> anyhow::Result<()> {
     if a.repeats == 0 {
         bail!("--repeats: expected at least 1, got 0");
     }
     auto_e2h::nn::tune_allocator();
     auto_e2h::learn::set_threads(a.threads)?;
-    let mut work = Workload::new(a.size, a.batch, a.data.as_deref())?;
+    let compute = Compute::open(&a.device, Precision { tf32: a.tf32, bf16: a.bf16 })?;
+    let mut work = Workload::new(a.size, a.batch, a.data.as_deref(), &compute)?;
 
     let mut first = None;
-    let step = median(a.repeats, || {
+    let step = median(a.repeats, &compute, || {
         let loss = work.step()?;
         first.get_or_insert(loss);
         Ok(())
     })?;
-    let forward = median(a.repeats, || work.forward())?;
-    let ddim1 = median(a.repeats, work.sampler(1)?)?;
-    let ddim8 = median(a.repeats, work.sampler(8)?)?;
+    let forward = median(a.repeats, &compute, || work.forward())?;
+    let ddim1 = median(a.repeats, &compute, work.sampler(1)?)?;
+    let ddim8 = median(a.repeats, &compute, work.sampler(8)?)?;
 
     let (size, batch, params) = (a.size.name(), work.batch(), work.parameters());
     let (loss, peak) = (first.unwrap_or(f32::NAN), peak_mb());
@@ -102,19 +126,19 @@ fn main() -> anyhow::Result<()> {
             "{}",
             serde_json::json!({
                 "peer": concat!("auto-e2h ", env!("CARGO_PKG_VERSION")), "variant": "default", "size": size,
-                "device": "cpu", "batch": batch, "threads": a.threads, "params": params, "forward": forward,
+                "device": compute.name(), "tf32": a.tf32, "bf16": a.bf16, "batch": batch, "threads": a.threads, "params": params, "forward": forward,
                 "step": step, "ddim1": ddim1, "ddim8": ddim8, "rss_mb": peak, "loss": loss,
             })
         );
     } else {
-        println!("{size}: {params} parameters, batch {batch}, {} thread(s)", a.threads);
+        println!("{size}: {params} parameters, batch {batch}, {} thread(s), {}", a.threads, compute.name());
         println!("  training step      {step:8.2} ms   (loss of the first {loss:.6})");
         println!("  forward            {forward:8.2} ms");
         println!("  sampling, 1        {ddim1:8.2} ms");
         println!("  sampling, 8        {ddim8:8.2} ms");
         println!("  peak memory        {:8} MB", peak.unwrap_or(0));
         if a.roofline {
-            let (product, reached) = (product_rate(a.repeats)?, work.step_flop() / (1e-3 * step));
+            let (product, reached) = (product_rate(a.repeats, &compute)?, work.step_flop() / (1e-3 * step));
             println!("  matrix product     {:8.1} GFLOP/s", 1e-9 * product);
             println!(
                 "  training step      {:8.1} GFLOP/s, {:.0} % of it",

@@ -18,7 +18,10 @@ fn wrong_configuration_is_refused_before_any_work() {
     fails(&mut nut_assembly(&out, &["--set", "loop.cycles=few"]), &["loop.cycles", "integer", "few"]);
     fails(&mut nut_assembly(&out, &["--set", "policy.horizon=15"]), &["horizon", "multiple of 2", "15"]);
     fails(&mut nut_assembly(&out, &["--set", "task.variant=rund"]), &["rund", "round"]);
-    fails(&mut nut_assembly(&out, &["--device", "cuda"]), &["CPU only"]);
+    #[cfg(not(feature = "cuda"))]
+    fails(&mut nut_assembly(&out, &["--device", "cuda"]), &["`cuda`", "without CUDA", "--features cuda"]);
+    fails(&mut nut_assembly(&out, &["--device", "cuda:x"]), &["`cuda:x`", "expected cpu, cuda or cuda:N"]);
+    fails(&mut nut_assembly(&out, &["--set", "device.fp16=true"]), &["device.fp16", "device.bf16"]);
     fails(&mut nut_assembly(&out, &["--threads", "0"]), &["threads", "at least 1"]);
     assert!(!out.exists(), "a refused run left a folder");
 }

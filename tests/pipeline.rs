@@ -12,6 +12,7 @@ fn options(out: &Path) -> RunOptions {
         set: vec!["env.horizon_hard=500".to_owned(), "env.horizon_easy=500".to_owned()],
         out: Some(out.to_owned()),
         resume: false,
+        device: "cpu".to_owned(),
         threads: None,
         quiet: true,
         tensorboard: false,

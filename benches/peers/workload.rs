@@ -4,7 +4,9 @@
 use anyhow::Context;
 use auto_e2h::core::stream;
 use auto_e2h::nn::candle_core::{Device, Tensor};
-use auto_e2h::nn::{Adam, AdamConfig, Ema, EmaConfig, Mode, Weights, backward, load_weights, mse, no_grad};
+use auto_e2h::nn::{
+    Adam, AdamConfig, Compute, Ema, EmaConfig, Mode, Weights, backward, load_weights, mse, no_grad,
+};
 use auto_e2h::policy::{Ddim, DiffusionModel, PolicyConfig, Prediction};
 use rand::Rng;
 use std::path::Path;
@@ -75,7 +77,7 @@ impl Size {
 const ACTION: usize = 8;
 const STATE: usize = 30;
 
-/// What a step needs, on the host.
+/// What a step needs; vectors on the host.
 struct Data {
     images: [Tensor; 2],
     state: Tensor,
@@ -86,27 +88,27 @@ struct Data {
 
 impl Data {
     /// Random data like PyTorch's.
-    fn random(c: &PolicyConfig, b: usize) -> anyhow::Result<Self> {
+    fn random(c: &PolicyConfig, b: usize, device: &Device) -> anyhow::Result<Self> {
         let mut rng = stream(0, "peer", 0, 0);
         let n = b * 2 * c.crop_size * c.crop_size * 3;
         let mut image = || {
             Tensor::from_vec(
                 (0..n).map(|_| rng.random::<f32>()).collect::<Vec<_>>(),
                 (b * 2, c.crop_size, c.crop_size, 3),
-                &Device::Cpu,
+                device,
             )
         };
         let images = [image()?, image()?];
         let mut normal =
             |n: usize| -> Vec<f32> { (0..n).map(|_| rng.sample(rand_distr::StandardNormal)).collect() };
-        let state = Tensor::from_vec(normal(b * STATE), (b, STATE), &Device::Cpu)?;
+        let state = Tensor::from_vec(normal(b * STATE), (b, STATE), device)?;
         let (actions, noise) = (normal(b * c.horizon * ACTION), normal(b * c.horizon * ACTION));
         let timesteps = (0..b).map(|i| (i * 37 % 100) as f32).collect();
         Ok(Self { images, state, actions, noise, timesteps })
     }
 
     /// The data among dumped tensors; what is left of them are the weights.
-    fn dumped(c: &PolicyConfig, all: &mut Weights) -> anyhow::Result<Self> {
+    fn dumped(c: &PolicyConfig, all: &mut Weights, device: &Device) -> anyhow::Result<Self> {
         let mut take = |name: &str| {
             all.remove(name).with_context(|| format!("expected tensor `{name}` in the file, found none"))
         };
@@ -123,11 +125,11 @@ impl Data {
                 .flatten()
                 .copied()
                 .collect::<Vec<f32>>();
-            Tensor::from_vec(data, (b * 2, c.crop_size, c.crop_size, 3), &Device::Cpu)
+            Tensor::from_vec(data, (b * 2, c.crop_size, c.crop_size, 3), device)
         };
         Ok(Self {
             images: [camera(0)?, camera(1)?],
-            state: Tensor::from_vec(state.data, (b, STATE), &Device::Cpu)?,
+            state: Tensor::from_vec(state.data, (b, STATE), device)?,
             actions: take("actions")?.data,
             noise: take("noise")?.data,
             timesteps: take("timesteps")?.data,
@@ -149,17 +151,22 @@ pub(crate) struct Workload {
 
 impl Workload {
     /// With the weights and data that `train_step.py --dump` wrote, or random ones.
-    pub(crate) fn new(size: Size, batch: Option<usize>, dump: Option<&Path>) -> anyhow::Result<Self> {
-        let config = size.config();
-        let model = DiffusionModel::new(&config, Mode::Train, &mut stream(0, "weights", 0, 0))?;
+    pub(crate) fn new(
+        size: Size,
+        batch: Option<usize>,
+        dump: Option<&Path>,
+        compute: &Compute,
+    ) -> anyhow::Result<Self> {
+        let (config, device) = (size.config(), compute.device());
+        let model = DiffusionModel::new_on(compute, &config, Mode::Train, &mut stream(0, "weights", 0, 0))?;
         let data = match dump {
             Some(file) => {
                 let (mut all, _) = load_weights(file)?;
-                let data = Data::dumped(&config, &mut all)?;
+                let data = Data::dumped(&config, &mut all, device)?;
                 model.params().import(&all)?;
                 data
             }
-            None => Data::random(&config, batch.unwrap_or(size.batch()))?,
+            None => Data::random(&config, batch.unwrap_or(size.batch()), device)?,
         };
         let ddim = Ddim::new(config.train_timesteps, config.inference_steps, config.prediction)?;
         let adam =
@@ -168,7 +175,7 @@ impl Workload {
         // At this power the average moves by a thousandth from the second step on, as PyTorch's does.
         let ema = Ema::new(&EmaConfig { power: 20.0, max: 0.999 }, model.params())?;
         let shape = (data.timesteps.len(), config.horizon, ACTION);
-        let target = Tensor::from_slice(&data.noise, shape, &Device::Cpu)?;
+        let target = Tensor::from_slice(&data.noise, shape, device)?;
         Ok(Self { size, config, model, ddim, adam, ema, data, target })
     }
 
@@ -196,7 +203,7 @@ impl Workload {
         for ((x, e), t) in samples.zip(&data.timesteps) {
             self.ddim.add_noise(x, e, *t as usize);
         }
-        let noisy = Tensor::from_vec(noisy, self.target.dims(), &Device::Cpu)?;
+        let noisy = Tensor::from_vec(noisy, self.target.dims(), model.device())?;
         let condition = model.condition(&data.state, &data.images)?;
         let loss = mse(&model.forward(&noisy, &data.timesteps, &condition)?, &self.target, None)?;
         let grads = backward(&loss, model.params())?;
@@ -216,13 +223,13 @@ impl Workload {
 
     /// A sampler of `b` chunks of actions: encoder once, U-Net once a DDIM step.
     pub(crate) fn sampler(&self, b: usize) -> anyhow::Result<impl FnMut() -> anyhow::Result<()>> {
-        let d = Data::random(&self.config, b)?;
+        let d = Data::random(&self.config, b, self.model.device())?;
         let shape = (b, self.config.horizon, ACTION);
         Ok(move || {
             let condition = no_grad(|| self.model.condition(&d.state, &d.images))?;
             let mut x = d.actions.clone();
             for s in self.ddim.steps() {
-                let input = Tensor::from_slice(&x, shape, &Device::Cpu)?;
+                let input = Tensor::from_slice(&x, shape, self.model.device())?;
                 let timesteps = vec![s.timestep as f32; b];
                 let output = no_grad(|| self.model.forward(&input, &timesteps, &condition))?;
                 self.ddim.step(s, &output.flatten_all()?.to_vec1::<f32>()?, &mut x);

@@ -3,6 +3,7 @@
 use crate::{Error, Result};
 use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
+use e2h_nn::Precision;
 use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
 use e2h_refine::{AdvantageConfig, GateConfig, GoalConfig, KinematicConfig, ReverseConfig, SuffixConfig};
 use serde::{Deserialize, Serialize};
@@ -52,6 +53,9 @@ pub struct RunConfig {
     pub critic: CriticStage,
     /// Measuring success.
     pub evaluation: EvaluationConfig,
+    /// How exact a GPU multiplies; without effect on the CPU. Checkpoints from before it have none.
+    #[serde(default)]
+    pub device: Precision,
 }
 
 /// The task pair of a run.

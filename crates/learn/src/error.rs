@@ -49,6 +49,9 @@ pub enum Error {
     /// The simulation failed.
     #[error(transparent)]
     Env(#[from] e2h_env::Error),
+    /// A device or a network failed.
+    #[error(transparent)]
+    Nn(#[from] e2h_nn::Error),
     /// A policy or critic failed.
     #[error(transparent)]
     Policy(#[from] e2h_policy::Error),

@@ -12,6 +12,7 @@
 //!     set: vec!["loop.cycles=2".to_owned()],
 //!     out: None,
 //!     resume: false,
+//!     device: "cpu".to_owned(),
 //!     threads: None,
 //!     quiet: false,
 //!     tensorboard: false,

@@ -15,6 +15,7 @@ use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Episode, Kind, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_env::{Env, Task, demonstrate};
+use e2h_nn::Compute;
 use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData, train_critic};
 use e2h_refine::{Goal, Refined, critic_filter, gate, kinematic_filter, reverse};
 use serde::{Deserialize, Serialize};
@@ -38,6 +39,9 @@ pub struct RunOptions {
     pub out: Option<PathBuf>,
     /// Go on with a run directory that exists.
     pub resume: bool,
+    /// Where networks are computed: `cpu`, `cuda` or `cuda:N`. Not part of a run: it may go on elsewhere, and then ends
+    /// with other last digits.
+    pub device: String,
     /// Threads; by default as many as there are cores. Never changes a result.
     pub threads: Option<usize>,
     /// Show no progress.
@@ -52,6 +56,7 @@ pub struct Run {
     resolved: Resolved,
     dir: Directory,
     progress: Progress,
+    compute: Compute,
     task: Arc<dyn Task>,
     env: Env,
 }
@@ -92,7 +97,7 @@ impl Run {
     /// Checks everything that can be checked before any work, then makes or opens the run directory.
     ///
     /// # Errors
-    /// A configuration that cannot work, an unknown task, a run directory that exists (without `resume`) or is another
+    /// A configuration that cannot work, an unknown task, a device that is not there, a run directory that exists (without `resume`) or is another
     /// run's.
     pub fn open(options: &RunOptions) -> Result<Self> {
         e2h_nn::tune_allocator();
@@ -101,6 +106,7 @@ impl Run {
             set_threads(n)?;
         }
         let config = &resolved.config;
+        let compute = Compute::open(&options.device, config.device)?;
         let task = e2h_env::task(&config.task.name, &config.task.options())?;
         let env = Env::new(task.clone(), &config.env)?;
         let path = options.out.clone().unwrap_or_else(|| {
@@ -108,7 +114,7 @@ impl Run {
         });
         let dir = Directory::open(&path, options.resume, &options.task, options.seed, &resolved)?;
         let progress = Progress::new(options.quiet);
-        Ok(Self { options: options.clone(), resolved, dir, progress, task, env })
+        Ok(Self { options: options.clone(), resolved, dir, progress, compute, task, env })
     }
 
     /// The resolved configuration.
@@ -272,7 +278,7 @@ impl Run {
         let c = self.config();
         let notes_file = format!("{place}/notes.json");
         if self.dir.get::<TrainNotes>(&notes_file)?.is_some() {
-            return Ok(DiffusionPolicy::load(&self.dir.join(place))?.0);
+            return Ok(DiffusionPolicy::load(&self.dir.join(place))?.0.on(&self.compute)?);
         }
         let clock = Instant::now();
         let share = c.closed_loop.base_share;
@@ -280,7 +286,8 @@ impl Run {
         let weights = start.map(DiffusionPolicy::weights).transpose()?;
         let purpose = format!("train/{direction}/{iteration}");
         let mut trainer =
-            Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?;
+            Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?
+                .on(&self.compute)?;
         let saved = self.dir.join(format!("{place}/training.safetensors"));
         if saved.exists() {
             trainer.restore(&saved)?;
@@ -322,7 +329,8 @@ impl Run {
             (0, Some(weights)) => weights,
             _ => trainer.weights()?,
         };
-        let policy = DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?;
+        let policy =
+            DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?.on(&self.compute)?;
         policy.save(&self.dir.join(place), &self.provenance(direction, iteration)?)?;
         let minutes = clock.elapsed().as_secs_f64() / 60.0;
         self.dir.put(&notes_file, &TrainNotes { minutes, loss })?;
@@ -451,6 +459,7 @@ impl Run {
             let (critic, report) = train_critic(
                 &c.policy,
                 network,
+                &self.compute,
                 &base.normaliser,
                 &policy.weights()?,
                 &collected.hard,

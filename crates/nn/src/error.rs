@@ -36,6 +36,14 @@ pub enum Error {
         /// `name: expected [..], found [..]`.
         misshaped: Vec<String>,
     },
+    /// A device that cannot compute.
+    #[error("device `{asked}`: {problem}")]
+    Device {
+        /// The name that was asked for.
+        asked: String,
+        /// What was expected and what was found, in one line.
+        problem: String,
+    },
     /// A parameter name was used twice while layers were built.
     #[error("parameter `{0}`: expected a name of its own, found it twice")]
     Duplicate(String),
@@ -53,7 +61,9 @@ pub enum Error {
     #[error("weight gradients: expected a call to `e2h_nn::backward`, found Candle's `Tensor::backward`")]
     NotRecording,
     /// A second backward pass through one forward pass.
-    #[error("backward pass: expected a new forward pass, found one whose values an earlier backward pass has freed")]
+    #[error(
+        "backward pass: expected a new forward pass, found one whose values an earlier backward pass has freed"
+    )]
     Freed,
     /// A file could not be read or written.
     #[error("{doing} {}: {source}", path.display())]

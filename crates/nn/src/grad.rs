@@ -1,4 +1,6 @@
+use crate::graph;
 use crate::kernel::{self, add_assign};
+use crate::numbers::{Numbers, elsewhere};
 use crate::params::{Params, with};
 use crate::weights::Weights;
 use crate::{Error, Result};
@@ -52,14 +54,27 @@ pub(crate) fn give(list: Vec<(TensorId, Vec<f32>)>) -> Result<()> {
 #[derive(Debug, Clone)]
 pub struct Grads {
     /// In the order of the parameters; `None` where the loss does not depend on one.
-    pub(crate) list: Vec<Option<Vec<f32>>>,
+    pub(crate) list: Vec<Option<Numbers>>,
 }
 
 impl Grads {
     /// The Euclidean norm over all parameters.
-    #[must_use]
-    pub fn norm(&self) -> f32 {
-        self.list.iter().flatten().map(|g| kernel::optim::squares(g)).sum::<f64>().sqrt() as f32
+    ///
+    /// # Errors
+    /// [`Error::Candle`] when a device fails; none on the CPU.
+    pub fn norm(&self) -> Result<f32> {
+        let (mut sum, mut elsewhere) = (0.0, Vec::new());
+        for g in self.list.iter().flatten() {
+            match g {
+                Numbers::Host(g) => sum += kernel::optim::squares(g),
+                Numbers::Device(g) => elsewhere.push(graph::optim::squares(g)?),
+            }
+        }
+        if !elsewhere.is_empty() {
+            // One number comes back, and with it the wait for the device.
+            sum += f64::from(Tensor::stack(&elsewhere, 0)?.sum_all()?.to_scalar::<f32>()?);
+        }
+        Ok(sum.sqrt() as f32)
     }
 
     /// Adds `other`, for a batch that is taken in parts.
@@ -67,7 +82,7 @@ impl Grads {
     /// # Errors
     /// [`Error::OtherParams`] when `other` is of another network.
     pub fn add(&mut self, other: &Self) -> Result<()> {
-        let same = |(a, b): (&Option<Vec<f32>>, &Option<Vec<f32>>)| {
+        let same = |(a, b): (&Option<Numbers>, &Option<Numbers>)| {
             a.as_ref().zip(b.as_ref()).is_none_or(|(a, b)| a.len() == b.len())
         };
         if self.list.len() != other.list.len() || !self.list.iter().zip(&other.list).all(same) {
@@ -76,7 +91,9 @@ impl Grads {
         }
         for (a, b) in self.list.iter_mut().zip(&other.list) {
             match (a, b) {
-                (Some(a), Some(b)) => add_assign(a, b),
+                (Some(Numbers::Host(a)), Some(Numbers::Host(b))) => add_assign(a, b),
+                (Some(Numbers::Device(a)), Some(Numbers::Device(b))) => *a = (&*a + b)?,
+                (Some(_), Some(_)) => return Err(elsewhere("gradients", other.list.len())),
                 (a @ None, Some(b)) => *a = Some(b.clone()),
                 (_, None) => {}
             }
@@ -85,8 +102,17 @@ impl Grads {
     }
 
     /// Multiplies all gradients.
-    pub fn scale(&mut self, factor: f32) {
-        self.list.iter_mut().flatten().flatten().for_each(|g| *g *= factor);
+    ///
+    /// # Errors
+    /// [`Error::Candle`] when a device fails; none on the CPU.
+    pub fn scale(&mut self, factor: f32) -> Result<()> {
+        for g in self.list.iter_mut().flatten() {
+            match g {
+                Numbers::Host(g) => g.iter_mut().for_each(|g| *g *= factor),
+                Numbers::Device(g) => *g = g.affine(f64::from(factor), 0.0)?,
+            }
+        }
+        Ok(())
     }
 
     /// Gradients by parameter name in PyTorch's layout, zeros where the loss does not depend on one.
@@ -95,14 +121,16 @@ impl Grads {
     /// [`Error::OtherParams`] when they are of another network.
     pub fn export(&self, params: &Params) -> Result<Weights> {
         self.check(params)?;
-        let full =
-            |(g, v): (&Option<Vec<f32>>, &candle_core::Var)| g.clone().unwrap_or(vec![0.0; v.elem_count()]);
-        let list: Vec<Vec<f32>> = self.list.iter().zip(params.variables()).map(full).collect();
-        Ok(params.all_outward(&list))
+        let full = |(g, v): (&Option<Numbers>, &candle_core::Var)| match g {
+            Some(g) => Ok(g.clone()),
+            None => Numbers::zeros(v, params.in_graph()),
+        };
+        let list: Result<Vec<Numbers>> = self.list.iter().zip(params.variables()).map(full).collect();
+        params.all_outward(&list?)
     }
 
     pub(crate) fn check(&self, params: &Params) -> Result<()> {
-        let fits = |(g, v): (&Option<Vec<f32>>, &candle_core::Var)| {
+        let fits = |(g, v): (&Option<Numbers>, &candle_core::Var)| {
             g.as_ref().is_none_or(|g| g.len() == v.elem_count())
         };
         if self.list.len() == params.len() && self.list.iter().zip(params.variables()).all(fits) {
@@ -150,6 +178,11 @@ pub fn backward_many(loss: &Tensor, networks: &[&Params]) -> Result<Vec<Grads>> 
     for params in networks {
         let mut list = Vec::with_capacity(params.len());
         for var in params.variables() {
+            if params.in_graph() {
+                let g = store.get(var.as_tensor()).map(Tensor::contiguous).transpose()?;
+                list.push(g.map(Numbers::Device));
+                continue;
+            }
             let mut g = found.remove(&var.as_tensor().id());
             // A variable used through Candle's own operations has its gradient there.
             if let Some(t) = store.get(var.as_tensor()) {
@@ -159,7 +192,7 @@ pub fn backward_many(loss: &Tensor, networks: &[&Params]) -> Result<Vec<Grads>> 
                     None => g = Some(more),
                 }
             }
-            list.push(g);
+            list.push(g.map(Numbers::Host));
         }
         out.push(Grads { list });
     }

@@ -1,4 +1,5 @@
-//! Networks that learn on the CPU: layers on Candle tensors with kernels of their own, optimisers, weight files.
+//! Networks that learn on the CPU: layers on Candle tensors with kernels of their own, optimisers, weight files. With
+//! feature `cuda` they run on a GPU too, see [`Compute`].
 //!
 //! Several of Candle's gradients are wrong without an error, and its graph allocates for every gradient that flows. Here a
 //! network's forward pass is one node of Candle's graph with a backward pass of its own, over channels-last buffers and
@@ -28,13 +29,16 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod compute;
 mod error;
 mod grad;
+mod graph;
 mod kernel;
 mod layers;
 mod loss;
 mod memory;
 mod mlp;
+mod numbers;
 mod optim;
 mod params;
 mod rgb;
@@ -44,6 +48,7 @@ mod weights;
 
 /// The tensors of this crate's interface.
 pub use candle_core;
+pub use compute::{Compute, Precision, candle_operations};
 pub use error::{Error, Result};
 pub use grad::{Grads, backward, backward_many, no_grad};
 pub use layers::{

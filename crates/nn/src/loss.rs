@@ -1,3 +1,4 @@
+use crate::graph;
 use crate::tape::{Flow, Node, Step, Values, run};
 use crate::{Error, Result};
 use candle_core::Tensor;
@@ -69,6 +70,10 @@ pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Res
         });
     }
     run(&[prediction, target], None, |tape, n| {
+        if tape.in_graph() {
+            let (p, t) = (tape.tensor(n[0])?, tape.tensor(n[1])?);
+            return Ok(tape.put(graph::act::squared_error(p, t, &weights, 1.0 / count)?));
+        }
         let (p, t) = (tape.read(n[0])?, tape.read(n[1])?);
         let square =
             |p: &[f32], t: &[f32]| p.iter().zip(t).map(|(p, t)| f64::from(p - t).powi(2)).sum::<f64>();

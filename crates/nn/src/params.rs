@@ -1,7 +1,9 @@
+use crate::compute::Compute;
 use crate::kernel::conv::in_panels;
+use crate::numbers::Numbers;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
-use candle_core::{CpuStorage, Device, InplaceOp1, Layout, Storage, Tensor, Var};
+use candle_core::{CpuStorage, InplaceOp1, Layout, Storage, Tensor, Var};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use std::cell::{Cell, RefCell};
@@ -18,7 +20,7 @@ pub enum Mode {
 }
 
 /// How a weight's axes lie here: `order[j]` is the PyTorch axis that is our axis j, and the last is cut into the panels of
-/// [`crate::kernel::conv::panel`]. `None` keeps PyTorch's, uncut.
+/// [`crate::kernel::conv::panel`] where our kernels read it. `None` keeps PyTorch's, uncut.
 pub(crate) type Order = Option<&'static [usize]>;
 
 /// A weight as a layer holds it.
@@ -26,6 +28,10 @@ pub(crate) type Order = Option<&'static [usize]>;
 pub(crate) struct Weight {
     pub(crate) tensor: Tensor,
     pub(crate) train: bool,
+    /// Whether it is for Candle's operations, uncut, instead of our kernels.
+    pub(crate) graph: bool,
+    /// Whether products read it as `bf16`.
+    pub(crate) bf16: bool,
 }
 
 /// How a parameter starts.
@@ -42,10 +48,38 @@ struct Param {
     /// PyTorch's shape.
     shape: Vec<usize>,
     order: Order,
+    /// Whether the last axis is cut into panels.
+    cut: bool,
+}
+
+impl Param {
+    /// From PyTorch's layout to ours.
+    fn inward(&self, data: &[f32]) -> Vec<f32> {
+        let Some(order) = self.order else { return data.to_vec() };
+        let data = permute_axes(data, &self.shape, order, true);
+        if self.cut { in_panels(&data, self.columns(order), false) } else { data }
+    }
+
+    /// From our layout to PyTorch's.
+    fn outward(&self, data: &[f32]) -> HostTensor {
+        let data = match self.order {
+            None => data.to_vec(),
+            Some(order) if self.cut => {
+                permute_axes(&in_panels(data, self.columns(order), true), &self.shape, order, false)
+            }
+            Some(order) => permute_axes(data, &self.shape, order, false),
+        };
+        HostTensor { shape: self.shape.clone(), data }
+    }
+
+    fn columns(&self, order: &[usize]) -> usize {
+        order.last().map_or(1, |a| self.shape[*a])
+    }
 }
 
 struct Shared {
     mode: Mode,
+    compute: Compute,
     rng: RefCell<ChaCha8Rng>,
     params: RefCell<BTreeMap<String, Param>>,
     duplicate: Cell<Option<String>>,
@@ -85,16 +119,18 @@ impl Builder<'_> {
             Init::Zeros => vec![0.0; n],
         };
         let inner: Vec<usize> = order.map_or(shape.to_vec(), |o| o.iter().map(|a| shape[*a]).collect());
-        let data =
-            if order.is_some() { in_panels(&data, inner.last().copied().unwrap_or(1), false) } else { data };
-        let var = Var::from_vec(data, inner, &Device::Cpu)?;
+        let compute = &self.shared.compute;
+        let (graph, bf16) = (compute.through_candle(), compute.bf16());
+        let cut = order.is_some() && !graph;
+        let data = if cut { in_panels(&data, inner.last().copied().unwrap_or(1), false) } else { data };
+        let var = Var::from_vec(data, inner, compute.device())?;
         let train = self.shared.mode == Mode::Train;
         let tensor = if train { var.as_tensor().clone() } else { var.as_detached_tensor() };
-        let param = Param { var, shape: shape.to_vec(), order };
+        let param = Param { var, shape: shape.to_vec(), order, cut };
         if self.shared.params.borrow_mut().insert(name.clone(), param).is_some() {
             self.shared.duplicate.set(Some(name));
         }
-        Ok(Weight { tensor, train })
+        Ok(Weight { tensor, train, graph, bf16 })
     }
 }
 
@@ -104,6 +140,9 @@ impl Builder<'_> {
 #[derive(Clone)]
 pub struct Params {
     params: Arc<BTreeMap<String, Param>>,
+    compute: Compute,
+    /// Whether gradients and what follows them are tensors.
+    graph: bool,
 }
 
 impl std::fmt::Debug for Params {
@@ -113,7 +152,7 @@ impl std::fmt::Debug for Params {
 }
 
 impl Params {
-    /// Builds a network with `f` and returns its parameters beside it.
+    /// Builds a network on the CPU with `f` and returns its parameters beside it.
     ///
     /// They start as in PyTorch: weights and biases of linear and convolution layers uniform in plus or minus
     /// 1 / sqrt(fan in), gains of norms 1, their biases 0, drawn from `rng` in the order of building.
@@ -125,8 +164,22 @@ impl Params {
         rng: &mut ChaCha8Rng,
         f: impl FnOnce(&Builder<'_>) -> Result<T>,
     ) -> Result<(Self, T)> {
+        Self::build_on(&Compute::cpu(), mode, rng, f)
+    }
+
+    /// [`Params::build`] on any device. The same `rng` gives the same weights everywhere.
+    ///
+    /// # Errors
+    /// As [`Params::build`], and [`Error::Candle`] when the device fails.
+    pub fn build_on<T>(
+        compute: &Compute,
+        mode: Mode,
+        rng: &mut ChaCha8Rng,
+        f: impl FnOnce(&Builder<'_>) -> Result<T>,
+    ) -> Result<(Self, T)> {
         let shared = Shared {
             mode,
+            compute: compute.clone(),
             rng: RefCell::new(rng.clone()),
             params: RefCell::default(),
             duplicate: Cell::default(),
@@ -136,7 +189,28 @@ impl Params {
         if let Some(name) = shared.duplicate.take() {
             return Err(Error::Duplicate(name));
         }
-        Ok((Self { params: Arc::new(shared.params.into_inner()) }, built))
+        let graph = compute.through_candle();
+        let params = Arc::new(shared.params.into_inner());
+        Ok((Self { params, compute: shared.compute, graph }, built))
+    }
+
+    /// Where they are, and how they are computed with.
+    #[must_use]
+    pub fn compute(&self) -> &Compute {
+        &self.compute
+    }
+
+    /// Whether a network built with `compute` would be the same in place and arithmetic.
+    #[must_use]
+    pub fn is_on(&self, compute: &Compute) -> bool {
+        self.compute.device().same_device(compute.device())
+            && self.compute.bf16() == compute.bf16()
+            && self.graph == compute.through_candle()
+    }
+
+    /// Whether gradients and what follows them are tensors.
+    pub(crate) fn in_graph(&self) -> bool {
+        self.graph
     }
 
     /// All parameters in PyTorch's layout.
@@ -146,8 +220,12 @@ impl Params {
     pub fn export(&self) -> Result<Weights> {
         let mut out = Weights::new();
         for (name, p) in self.params.iter() {
-            let data = with(p.var.as_tensor(), |d| permute(d, &p.shape, p.order, false))?;
-            out.insert(name.clone(), HostTensor { shape: p.shape.clone(), data });
+            let tensor = if self.graph {
+                p.outward(&host(p.var.as_tensor())?)
+            } else {
+                with(p.var.as_tensor(), |d| p.outward(d))?
+            };
+            out.insert(name.clone(), tensor);
         }
         Ok(out)
     }
@@ -159,8 +237,12 @@ impl Params {
     pub fn import(&self, weights: &Weights) -> Result<()> {
         self.matches(weights)?;
         for (param, tensor) in self.params.values().zip(weights.values()) {
-            let data = inward(&tensor.data, &param.shape, param.order);
-            edit(&param.var, |p| p.copy_from_slice(&data))?;
+            let data = param.inward(&tensor.data);
+            if self.graph {
+                param.var.set(&Tensor::from_vec(data, param.var.shape(), param.var.device())?)?;
+            } else {
+                edit(&param.var, |p| p.copy_from_slice(&data))?;
+            }
         }
         Ok(())
     }
@@ -214,38 +296,20 @@ impl Params {
     }
 
     /// All of `list`, one entry per parameter in our layout, by name in PyTorch's.
-    pub(crate) fn all_outward(&self, list: &[Vec<f32>]) -> Weights {
-        self.params
-            .iter()
-            .zip(list)
-            .map(|((n, p), d)| {
-                (n.clone(), HostTensor { shape: p.shape.clone(), data: permute(d, &p.shape, p.order, false) })
-            })
-            .collect()
+    pub(crate) fn all_outward(&self, list: &[Numbers]) -> Result<Weights> {
+        let each = self.params.iter().zip(list);
+        each.map(|((n, p), d)| Ok((n.clone(), p.outward(&d.host()?)))).collect()
     }
 
     /// The inverse of [`Params::all_outward`].
-    pub(crate) fn all_inward(&self, weights: &Weights) -> Result<Vec<Vec<f32>>> {
+    pub(crate) fn all_inward(&self, weights: &Weights) -> Result<Vec<Numbers>> {
         self.matches(weights)?;
         let each = self.params.values().zip(weights.values());
-        Ok(each.map(|(p, t)| inward(&t.data, &p.shape, p.order)).collect())
+        each.map(|(p, t)| Numbers::new(p.inward(&t.data), &p.var, self.graph)).collect()
     }
 }
 
-fn inward(data: &[f32], shape: &[usize], order: Order) -> Vec<f32> {
-    permute(data, shape, order, true)
-}
-
-/// Copies between PyTorch's layout `shape` and ours, in the direction asked for.
-fn permute(data: &[f32], shape: &[usize], order: Order, inward: bool) -> Vec<f32> {
-    let Some(order) = order else { return data.to_vec() };
-    let columns = order.last().map_or(1, |a| shape[*a]);
-    if !inward {
-        return permute_axes(&in_panels(data, columns, true), shape, order, false);
-    }
-    in_panels(&permute_axes(data, shape, order, true), columns, false)
-}
-
+/// Copies between PyTorch's layout `shape` and that of the permuted axes, in the direction asked for.
 fn permute_axes(data: &[f32], shape: &[usize], order: &[usize], inward: bool) -> Vec<f32> {
     let mut strides = vec![1; shape.len()];
     for i in (1..shape.len()).rev() {
@@ -284,6 +348,11 @@ pub(crate) fn slice<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f3
             found: format!("{:?} of {layout:?}", storage.dtype()),
         }),
     }
+}
+
+/// The numbers of a tensor, wherever it is.
+pub(crate) fn host(tensor: &Tensor) -> Result<Vec<f32>> {
+    Ok(tensor.flatten_all()?.to_vec1()?)
 }
 
 /// Runs `f` on the numbers of a contiguous tensor.

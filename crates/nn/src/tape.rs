@@ -3,7 +3,10 @@
 //! Candle's own graph allocates zeros and adds for every gradient that flows. Here a whole network is one node: inside it
 //! the first gradient of a value is moved and only further ones are added, and weight gradients go straight to the list
 //! that [`crate::backward`] collects.
+//!
+//! On other devices nothing is recorded: values are tensors that Candle tracks, see [`crate::graph`].
 
+use crate::compute::through_candle;
 use crate::grad;
 use crate::kernel::add_assign;
 use crate::params::{Weight, slice};
@@ -21,6 +24,8 @@ pub(crate) struct Node(usize);
 enum Value {
     Own(Vec<f32>),
     Given(Tensor),
+    /// On a tape of Candle's operations.
+    Tracked(Tensor),
     /// Freed, or handed to Candle.
     Gone,
 }
@@ -42,6 +47,7 @@ pub(crate) struct Tape {
     slots: Vec<Slot>,
     steps: Vec<(Node, Box<dyn Step>)>,
     record: bool,
+    graph: bool,
 }
 
 /// The numbers of a value, wherever they live.
@@ -82,8 +88,34 @@ impl Tape {
         match &self.slots[n.0].value {
             Value::Own(v) => Ok(Read::Own(v)),
             Value::Given(t) => read(t),
-            Value::Gone => Err(Error::NotRecording),
+            Value::Tracked(_) | Value::Gone => Err(Error::NotRecording),
         }
+    }
+
+    /// Whether layers are to compute with Candle's operations, on [`Tape::tensor`] and [`Tape::put`].
+    pub(crate) fn in_graph(&self) -> bool {
+        self.graph
+    }
+
+    /// A value as Candle sees it.
+    pub(crate) fn tensor(&self, n: Node) -> Result<&Tensor> {
+        match &self.slots[n.0].value {
+            Value::Tracked(t) => Ok(t),
+            _ => Err(Error::NotRecording),
+        }
+    }
+
+    /// A weight as Candle sees it: tracked only if there will be a backward pass.
+    pub(crate) fn weight(&self, w: &Weight) -> Tensor {
+        if self.record { w.tensor.clone() } else { w.tensor.detach() }
+    }
+
+    /// Adds a result that Candle tracks.
+    pub(crate) fn put(&mut self, tensor: Tensor) -> Node {
+        let node = Node(self.slots.len());
+        let (shape, grad) = (tensor.dims().to_vec(), tensor.track_op());
+        self.slots.push(Slot { value: Value::Tracked(tensor), shape, grad });
+        node
     }
 
     /// Adds a result. `step` is kept if something needs its gradient.
@@ -111,8 +143,10 @@ impl Tape {
 
     /// Says that a value is not read again in the forward pass: without a record its memory is freed.
     pub(crate) fn done(&mut self, n: Node) {
-        if !self.record && matches!(self.slots[n.0].value, Value::Own(_)) {
-            self.slots[n.0].value = Value::Gone;
+        let slot = &mut self.slots[n.0];
+        // What a backward pass needs of a tracked value, Candle holds.
+        if matches!(slot.value, Value::Tracked(_)) || !self.record && matches!(slot.value, Value::Own(_)) {
+            slot.value = Value::Gone;
         }
     }
 }
@@ -288,7 +322,11 @@ pub(crate) fn run(
 ) -> Result<Tensor> {
     let anchor = weight.filter(|w| w.train).map(|w| &w.tensor);
     let record = grad::enabled() && (anchor.is_some() || inputs.iter().any(|t| t.track_op()));
-    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record };
+    let graph = weight.map_or_else(|| through_candle(inputs), |w| w.graph);
+    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record, graph };
+    if graph {
+        return run_tracked(tape, inputs, weight, f);
+    }
     let mut nodes = Vec::with_capacity(inputs.len());
     let (mut arguments, mut tracked) = (Vec::new(), Vec::new());
     for input in inputs {
@@ -325,4 +363,28 @@ pub(crate) fn run(
         [a, b, c] => a.apply_op3(b, c, whole)?,
         _ => return Err(Error::NotRecording),
     })
+}
+
+/// [`run`] on Candle's operations, on the calling thread: the work is the device's.
+fn run_tracked(
+    mut tape: Tape,
+    inputs: &[&Tensor],
+    weight: Option<&Weight>,
+    f: impl FnOnce(&mut Tape, &[Node]) -> Result<Node>,
+) -> Result<Tensor> {
+    let device = weight.map(|w| w.tensor.device()).or(inputs.first().map(|t| t.device()));
+    let mut nodes = Vec::with_capacity(inputs.len());
+    for input in inputs {
+        if let Some(device) = device.filter(|d| !input.device().same_device(d)) {
+            return Err(Error::Config {
+                what: "place of an input",
+                expected: "the device of the network",
+                found: format!("{:?} instead of {:?}", input.device().location(), device.location()),
+            });
+        }
+        let tensor = input.contiguous()?;
+        nodes.push(tape.put(if tape.record { tensor } else { tensor.detach() }));
+    }
+    let out = f(&mut tape, &nodes)?;
+    Ok(tape.tensor(out)?.clone())
 }

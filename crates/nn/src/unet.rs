@@ -198,7 +198,7 @@ impl ConditionalUnet1d {
             let expected = format!("({b}, {})", self.config.cond_dim);
             return Err(Error::Shape { what: "u-net condition", expected, found: cond.dims().to_vec() });
         }
-        let embedded = sinusoidal_embedding(timesteps, self.config.step_embed_dim)?;
+        let embedded = sinusoidal_embedding(timesteps, self.config.step_embed_dim)?.to_device(x.device())?;
         run(&[x, cond, &embedded], Some(self.step1.anchor()), |tape, n| self.record(tape, n[0], n[1], n[2]))
     }
 

@@ -97,16 +97,16 @@ impl Host {
         }
     }
 
-    /// State (B, To * S) and one (B * steps, crop, crop, 3) tensor a camera.
-    pub(crate) fn tensors(self, crop: usize) -> Result<(Tensor, Vec<Tensor>)> {
+    /// State (B, To * S) and one (B * steps, crop, crop, 3) tensor a camera, on `device`.
+    pub(crate) fn tensors(self, crop: usize, device: &Device) -> Result<(Tensor, Vec<Tensor>)> {
         let width = self.state.len() / self.samples.max(1);
-        let state = Tensor::from_vec(self.state, (self.samples, width), &Device::Cpu)?;
+        let state = Tensor::from_vec(self.state, (self.samples, width), device)?;
         let images = self
             .images
             .into_iter()
             .map(|data| {
                 let n = data.len() / (crop * crop * 3);
-                Tensor::from_vec(data, (n, crop, crop, 3), &Device::Cpu)
+                Tensor::from_vec(data, (n, crop, crop, 3), device)
             })
             .collect::<candle_core::Result<_>>()?;
         Ok((state, images))

@@ -4,10 +4,10 @@ use crate::batch::{Host, Rows};
 use crate::config::without_zero_clip;
 use crate::model::ConditionEncoder;
 use crate::{CriticConfig, Error, PolicyConfig, Result};
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use e2h_core::{Episode, Rng, Value, stream};
 use e2h_data::Normaliser;
-use e2h_nn::{Adam, Mlp, Mode, Params, Weights, backward};
+use e2h_nn::{Adam, Compute, Mlp, Mode, Params, Weights, backward};
 use rand::Rng as _;
 use rand::seq::SliceRandom as _;
 
@@ -36,6 +36,7 @@ impl Critic {
     pub(crate) fn new(
         policy: &PolicyConfig,
         critic: &CriticConfig,
+        compute: &Compute,
         normaliser: &Normaliser,
         mode: Mode,
         seed: u64,
@@ -44,10 +45,12 @@ impl Critic {
         let dims: Vec<usize> =
             std::iter::once(config.condition_dim()).chain(critic.hidden.iter().copied()).chain([1]).collect();
         let mut condition = None;
-        let (params, head) = Params::build(mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
-            condition = Some(ConditionEncoder::new(&config, config.state_features(), &b.pp("diffusion")));
-            Mlp::new(&dims, critic.dropout, &b.pp("head"))
-        })?;
+        let (params, head) =
+            Params::build_on(compute, mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
+                condition =
+                    Some(ConditionEncoder::new(&config, config.state_features(), &b.pp("diffusion")));
+                Mlp::new(&dims, critic.dropout, &b.pp("head"))
+            })?;
         let condition =
             condition.unwrap_or_else(|| Err(Error::Config("the critic has no encoder".to_owned())))?;
         Ok(Self { params, condition, head, normaliser: normaliser.clone(), config })
@@ -65,7 +68,7 @@ impl Critic {
     }
 
     fn forward(&self, host: Host, dropout: Option<&mut Rng>) -> Result<Tensor> {
-        let (state, images) = host.tensors(self.config.crop_size)?;
+        let (state, images) = host.tensors(self.config.crop_size, self.params.compute().device())?;
         let condition = self.condition.forward(&state, &images)?;
         Ok(self.head.forward(&condition, dropout)?)
     }
@@ -147,7 +150,8 @@ fn target(episode: &Episode, t: usize, horizon: usize) -> f32 {
     terminal - remaining / (2.0 * horizon as f32)
 }
 
-/// Trains a critic from scratch on hard rollouts, failures included; its encoders start from the policy's weights.
+/// Trains a critic from scratch on hard rollouts, failures included; its encoders start from the policy's weights. It is
+/// computed, then and later, by `compute`.
 ///
 /// `progress` is told (steps done, loss) after every step.
 ///
@@ -157,6 +161,7 @@ fn target(episode: &Episode, t: usize, horizon: usize) -> f32 {
 pub fn train_critic(
     policy: &PolicyConfig,
     critic: &CriticConfig,
+    compute: &Compute,
     normaliser: &Normaliser,
     policy_weights: &Weights,
     rollouts: &[Episode],
@@ -173,7 +178,7 @@ pub fn train_critic(
     let held = ((order.len() as f32 * critic.validation) as usize).min(order.len() - 1);
     let (validation, training) = order.split_at(held);
 
-    let network = Critic::new(policy, critic, normaliser, Mode::Train, seed)?;
+    let network = Critic::new(policy, critic, compute, normaliser, Mode::Train, seed)?;
     network.adopt_encoders(policy_weights)?;
     let mut adam = Adam::new(&without_zero_clip(critic.adam), &network.params)?;
     let mut losses = Vec::with_capacity(critic.steps);
@@ -188,7 +193,7 @@ pub fn train_critic(
             network.push(&mut host, episode, t, Some((&mut rng, critic.colour_jitter)))?;
             targets.push(target(episode, t, horizon));
         }
-        let target = Tensor::from_vec(targets, (critic.batch, 1), &Device::Cpu)?;
+        let target = Tensor::from_vec(targets, (critic.batch, 1), compute.device())?;
         let loss = (network.forward(host, Some(&mut rng))? - target)?.sqr()?.mean_all()?;
         let value = loss.to_scalar::<f32>()?;
         if !value.is_finite() {
@@ -200,7 +205,7 @@ pub fn train_critic(
         progress(step + 1, value);
     }
 
-    let trained = Critic::new(policy, critic, normaliser, Mode::Infer, seed)?;
+    let trained = Critic::new(policy, critic, compute, normaliser, Mode::Infer, seed)?;
     trained.params.import(&network.params.export()?)?;
     let mut squares = (0.0, 0usize);
     for episode in validation {

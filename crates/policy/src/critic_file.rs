@@ -4,7 +4,7 @@ use crate::checkpoint::{hex, write_beside};
 use crate::{Critic, CriticConfig, Error, PolicyConfig, Result};
 use e2h_core::STATE_DIM;
 use e2h_data::Normaliser;
-use e2h_nn::Mode;
+use e2h_nn::{Compute, Mode};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -132,7 +132,7 @@ impl Critic {
             let problem = format!("expected SHA-256 {}, found {found}", file.weights_sha256);
             return Err(Error::Checkpoint { path: weights_path, problem });
         }
-        let critic = Self::new(&file.network, &file.critic, &normaliser, Mode::Infer, 0)?;
+        let critic = Self::new(&file.network, &file.critic, &Compute::cpu(), &normaliser, Mode::Infer, 0)?;
         let (weights, _) = e2h_nn::load_weights(&weights_path)?;
         critic
             .params

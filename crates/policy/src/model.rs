@@ -1,9 +1,9 @@
 //! Encoders, condition and U-Net: the network behind a policy.
 
 use crate::{PolicyConfig, Result};
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Rng};
-use e2h_nn::{Builder, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig};
+use e2h_nn::{Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig};
 
 /// Turns images and states into one vector an observation history.
 pub(crate) struct ConditionEncoder {
@@ -85,16 +85,26 @@ pub(crate) struct Widths {
 }
 
 impl DiffusionModel {
-    /// A network with freshly drawn weights.
+    /// A network with freshly drawn weights, on the CPU.
     ///
     /// # Errors
     /// When the configuration does not fit together.
     pub fn new(config: &PolicyConfig, mode: Mode, rng: &mut Rng) -> Result<Self> {
-        Self::of_widths(config, Widths { state: config.state_features(), action: ACTION_DIM }, mode, rng)
+        Self::new_on(&Compute::cpu(), config, mode, rng)
+    }
+
+    /// A network with freshly drawn weights, the same on every device.
+    ///
+    /// # Errors
+    /// When the configuration does not fit together, or the device fails.
+    pub fn new_on(compute: &Compute, config: &PolicyConfig, mode: Mode, rng: &mut Rng) -> Result<Self> {
+        let widths = Widths { state: config.state_features(), action: ACTION_DIM };
+        Self::of_widths(compute, config, widths, mode, rng)
     }
 
     /// The same for states and actions of other widths.
     pub(crate) fn of_widths(
+        compute: &Compute,
         config: &PolicyConfig,
         widths: Widths,
         mode: Mode,
@@ -110,7 +120,7 @@ impl DiffusionModel {
             cond_dim: config.condition_width(widths.state),
         };
         let mut condition = None;
-        let (params, unet) = Params::build(mode, rng, |b| {
+        let (params, unet) = Params::build_on(compute, mode, rng, |b| {
             let b = b.pp("diffusion");
             condition = Some(ConditionEncoder::new(config, widths.state, &b));
             ConditionalUnet1d::new(&unet, &b.pp("unet"))
@@ -124,6 +134,12 @@ impl DiffusionModel {
     #[must_use]
     pub fn params(&self) -> &Params {
         &self.params
+    }
+
+    /// Where its inputs have to be.
+    #[must_use]
+    pub fn device(&self) -> &Device {
+        self.params.compute().device()
     }
 
     /// The condition vector of observation histories.

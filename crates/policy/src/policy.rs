@@ -2,10 +2,10 @@
 
 use crate::batch::{Host, Rows};
 use crate::{Checkpoint, Ddim, DiffusionModel, Error, PolicyConfig, Provenance, Result, SamplerKind};
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use e2h_core::{ACTION_DIM, Action, ActionChunk, Observation, Policy, Rng, stream};
 use e2h_data::Normaliser;
-use e2h_nn::{Mode, Weights};
+use e2h_nn::{Compute, Mode, Weights};
 use rand::Rng as _;
 use std::path::Path;
 
@@ -36,6 +36,20 @@ impl DiffusionPolicy {
         let policy = Self::untrained(config, normaliser, 0)?;
         policy.model.params.import(weights)?;
         Ok(policy)
+    }
+
+    /// The same policy on another device.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn on(self, compute: &Compute) -> Result<Self> {
+        if self.model.params.is_on(compute) {
+            return Ok(self);
+        }
+        let model =
+            DiffusionModel::new_on(compute, &self.config, Mode::Infer, &mut stream(0, "weights", 0, 0))?;
+        model.params.import(&self.model.params.export()?)?;
+        Ok(Self { model, ..self })
     }
 
     /// Reads a checkpoint folder.
@@ -177,7 +191,8 @@ impl DiffusionPolicy {
                 }
             }
         }
-        let (state, images) = host.tensors(c.crop_size)?;
+        let device = self.model.device();
+        let (state, images) = host.tensors(c.crop_size, device)?;
         let condition = self.model.condition(&state, &images)?;
         let x = denoise(&self.model, &self.ddim, c, ACTION_DIM, &condition, noise)?;
         let first = if c.lerobot_alignment { c.n_obs_steps - 1 } else { 0 };
@@ -218,7 +233,7 @@ pub(crate) fn denoise(
     let free = (c.guidance != 1.0).then(|| condition.zeros_like()).transpose()?;
     for step in ddim.steps() {
         let timesteps = vec![step.timestep as f32; b];
-        let input = Tensor::from_slice(&x, (b, c.horizon, action_dim), &Device::Cpu)?;
+        let input = Tensor::from_slice(&x, (b, c.horizon, action_dim), model.device())?;
         let mut output = model.forward(&input, &timesteps, condition)?;
         if let Some(free) = &free {
             // Source: classifier-free guidance, arXiv 2207.12598, equation 6 in the form u + w (c - u).

@@ -5,7 +5,9 @@ use crate::{Ddim, DiffusionModel, Error, PolicyConfig, Prediction, Result, Train
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Episode, Rng, stream};
 use e2h_data::{Alignment, Normaliser, Sampler, Set, Window, WindowConfig, Windows};
-use e2h_nn::{Adam, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows};
+use e2h_nn::{
+    Adam, Compute, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows,
+};
 use rand::Rng as _;
 use std::path::Path;
 use std::sync::Arc;
@@ -113,6 +115,24 @@ impl Trainer {
         })
     }
 
+    /// The same training on another device, from where it is.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn on(self, compute: &Compute) -> Result<Self> {
+        if self.model.params.is_on(compute) {
+            return Ok(self);
+        }
+        let rng = &mut stream(self.seed, "weights", 0, 0);
+        let model = DiffusionModel::new_on(compute, &self.config, Mode::Train, rng)?;
+        model.params.import(&self.model.params.export()?)?;
+        let mut adam = Adam::new(&self.train.optimiser(), &model.params)?;
+        adam.load_state(&self.adam.state()?)?;
+        let mut ema = Ema::new(&self.train.ema, &model.params)?;
+        ema.load_state(&self.ema.state()?)?;
+        Ok(Self { model, adam, ema, ..self })
+    }
+
     /// Steps done.
     #[must_use]
     pub fn step_count(&self) -> usize {
@@ -203,14 +223,16 @@ impl Trainer {
                 keep.push(if rng.random::<f32>() < t.conditioning_dropout { 0.0 } else { 1.0f32 });
             }
         }
-        let (state, images) = host.tensors(c.crop_size)?;
+        let device = self.model.device();
+        let (state, images) = host.tensors(c.crop_size, device)?;
         let mut condition = repeat_rows(&self.model.condition(&state, &images)?, t.noises)?;
         if keep.contains(&0.0) {
-            condition = condition.broadcast_mul(&Tensor::from_vec(keep, (rows, 1), &Device::Cpu)?)?;
+            condition = condition.broadcast_mul(&Tensor::from_vec(keep, (rows, 1), device)?)?;
         }
         let shape = (rows, c.horizon, ACTION_DIM);
-        let noisy = Tensor::from_vec(noisy, shape, &Device::Cpu)?;
-        let target = Tensor::from_vec(target, shape, &Device::Cpu)?;
+        let noisy = Tensor::from_vec(noisy, shape, device)?;
+        let target = Tensor::from_vec(target, shape, device)?;
+        // The loss reads the mask on the host.
         let mask = Tensor::from_vec(mask, (rows, c.horizon), &Device::Cpu)?;
         let output = self.model.forward(&noisy, &timesteps, &condition)?;
         Ok(mse(&output, &target, Some(&mask))?)

@@ -138,9 +138,19 @@ fn a_critic_learns_that_successes_end_higher_than_failures() {
         adam: e2h_nn::AdamConfig { lr: 2e-3, ..Default::default() },
     };
     let weights = policy.weights().unwrap();
-    let (critic, report) =
-        train_critic(&config, &critic, &normaliser, &weights, &rollouts, 100, 0, "critic", |_, _| {})
-            .unwrap();
+    let (critic, report) = train_critic(
+        &config,
+        &critic,
+        &e2h_nn::Compute::cpu(),
+        &normaliser,
+        &weights,
+        &rollouts,
+        100,
+        0,
+        "critic",
+        |_, _| {},
+    )
+    .unwrap();
     assert!(report.train_loss < 0.05, "{}", report.train_loss);
     let values = critic.evaluate(&rollouts[0]).unwrap();
     assert_eq!(values.len(), 40);

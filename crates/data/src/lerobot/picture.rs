@@ -46,7 +46,7 @@ pub fn decode_image(file: &[u8], height: usize, width: usize, what: &str) -> Res
 ///
 /// # Errors
 /// When it is no PNG file or of another size; `path` and `what` say where it lay.
-pub fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
+pub(super) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
     let bad = |found: String| file_error(path, what, format!("a PNG image of {height} x {width}"), found);
     let broken = |e: png::DecodingError| bad(e.to_string());
     let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));

@@ -99,7 +99,7 @@ impl Run {
             preset: self.options.preset.clone(),
             seed: self.options.seed,
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            machine: machine(),
+            machine: machine(self.compute.name()),
             iterations: records,
             demonstration_steps: steps as f64 / base.easy.len().max(1) as f64,
         };
@@ -128,8 +128,8 @@ impl Run {
     }
 }
 
-/// Threads and the processor's name where the system tells it.
-fn machine() -> String {
+/// The processor's name where the system tells it, the threads, and the device of the networks if it is another.
+fn machine(device: &str) -> String {
     let name = std::fs::read_to_string("/proc/cpuinfo")
         .ok()
         .and_then(|text| {
@@ -137,5 +137,6 @@ fn machine() -> String {
             Some(line.split_once(':')?.1.trim().to_owned())
         })
         .unwrap_or_else(|| std::env::consts::ARCH.to_owned());
-    format!("{name}, {} threads", rayon::current_num_threads())
+    let also = if device == "cpu" { String::new() } else { format!(", networks on {device}") };
+    format!("{name}, {} threads{also}", rayon::current_num_threads())
 }

@@ -3,7 +3,6 @@
 use crate::Result;
 use e2h_core::{Direction, Episode, Image, Kind, Origin, Outcome};
 use e2h_data::lerobot::{ACTION_NAMES, STATE_NAMES, decode_png};
-use std::path::Path;
 
 /// One column over time.
 pub(super) struct Series {
@@ -35,17 +34,17 @@ impl Camera {
     /// The picture of a row.
     pub(super) fn image(&self, row: usize) -> Result<Image> {
         let (height, width) = (self.height, self.width);
-        let data = match &self.pictures {
+        match &self.pictures {
             Pictures::Raw(data) => {
                 let n = height * width * 3;
-                data.get(row * n..(row + 1) * n).unwrap_or(&[]).to_vec()
+                let data = data.get(row * n..(row + 1) * n).unwrap_or(&[]).to_vec();
+                Ok(Image { height, width, data })
             }
             Pictures::Png(files) => {
                 let file = files.get(row).map_or(&[][..], Vec::as_slice);
-                decode_png(file, height, width, Path::new(&self.name), &format!("row {row}"))?
+                Ok(decode_png(file, height, width, &format!("{}, row {row}", self.name))?)
             }
-        };
-        Ok(Image { height, width, data })
+        }
     }
 }
 

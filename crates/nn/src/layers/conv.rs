@@ -1,3 +1,4 @@
+use crate::graph;
 use crate::kernel::column_sums;
 use crate::kernel::conv::{self, Geo};
 use crate::params::{Builder, Init, Weight};
@@ -15,6 +16,12 @@ pub(crate) struct Convolution {
 
 impl Convolution {
     pub(crate) fn record(self, tape: &mut Tape, shape: Vec<usize>) -> Result<Node> {
+        if tape.in_graph() {
+            let (w, bias) = (tape.weight(&self.weight), self.bias.as_ref().map(|b| tape.weight(b)));
+            let x = tape.tensor(self.x)?;
+            let y = graph::linear::convolution(x, &w, bias.as_ref(), &self.geo, self.weight.bf16)?;
+            return Ok(tape.put(y.reshape(shape)?));
+        }
         let bias = self.bias.as_ref().map(|b| read(&b.tensor)).transpose()?;
         let y = conv::forward(&tape.read(self.x)?, &read(&self.weight.tensor)?, bias.as_deref(), &self.geo);
         drop(bias);
@@ -222,6 +229,11 @@ impl ConvTranspose1d {
         // The sizes of the convolution whose input gradient this is.
         let (c, n, kw) = (self.to, self.from, Self::KERNEL);
         let geo = Geo { b, h: 1, w: 2 * l, c, n, kh: 1, kw, sh: 1, sw: 2, ph: 0, pw: 1 };
+        if tape.in_graph() {
+            let (w, bias) = (tape.weight(&self.weight), tape.weight(&self.bias));
+            let y = graph::linear::transposed(tape.tensor(x)?, &w, &bias, &geo, self.weight.bf16)?;
+            return Ok(tape.put(y.reshape((b, 2 * l, c))?));
+        }
         let (weight, bias) = (self.weight.clone(), self.bias.clone());
         let y = conv::transposed_forward(&tape.read(x)?, &read(&weight.tensor)?, &read(&bias.tensor)?, &geo);
         let step = Transposed { x, weight, bias, geo };

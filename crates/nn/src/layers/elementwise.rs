@@ -1,3 +1,4 @@
+use crate::graph;
 use crate::kernel::{act, scratch};
 use crate::tape::{Flow, Node, Step, Tape, Values, run};
 use crate::{Error, Result};
@@ -15,7 +16,7 @@ impl Mish {
     /// Any.
     ///
     /// # Errors
-    /// [`Error::Config`] when `x` is not `f32` on the CPU.
+    /// [`Error::Config`] when `x` is on the CPU and not `f32`.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         run(&[x], None, |t, n| mish(t, n[0]))
     }
@@ -30,7 +31,7 @@ impl Relu {
     /// Any.
     ///
     /// # Errors
-    /// [`Error::Config`] when `x` is not `f32` on the CPU.
+    /// [`Error::Config`] when `x` is on the CPU and not `f32`.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         run(&[x], None, |t, n| relu(t, n[0]))
     }
@@ -47,6 +48,9 @@ impl Step for MishStep {
 }
 
 pub(crate) fn mish(tape: &mut Tape, x: Node) -> Result<Node> {
+    if tape.in_graph() {
+        return Ok(tape.put(graph::act::mish(tape.tensor(x)?)?));
+    }
     let y = act::mish_forward(&tape.read(x)?);
     Ok(tape.push(y, tape.shape(x).to_vec(), &[x], &[], MishStep(x)))
 }
@@ -65,6 +69,9 @@ impl Step for ReluStep {
 }
 
 pub(crate) fn relu(tape: &mut Tape, x: Node) -> Result<Node> {
+    if tape.in_graph() {
+        return Ok(tape.put(graph::act::relu(tape.tensor(x)?)?));
+    }
     let y = act::relu_forward(&tape.read(x)?);
     let step = ReluStep { x, y: tape.next() };
     Ok(tape.push(y, tape.shape(x).to_vec(), &[x], &[], step))
@@ -93,6 +100,9 @@ impl Film {
                     return Err(Error::Shape { what: "scale and shift", expected, found: found.to_vec() });
                 }
             };
+            if t.in_graph() {
+                return Ok(t.put(graph::act::film(t.tensor(n[0])?, t.tensor(n[1])?)?));
+            }
             let y = act::film_forward(&t.read(n[0])?, &t.read(n[1])?, steps, c);
             Ok(t.push(y, t.shape(n[0]).to_vec(), n, &[], FilmStep { x: n[0], e: n[1], steps, c }))
         })
@@ -157,6 +167,10 @@ pub(crate) fn concat(tape: &mut Tape, parts: &[Node]) -> Result<Node> {
         }
         widths.push(width);
     }
+    if tape.in_graph() {
+        let parts: Result<Vec<&Tensor>> = parts.iter().map(|n| tape.tensor(*n)).collect();
+        return Ok(tape.put(Tensor::cat(&parts?, shape.len())?));
+    }
     let (rows, width) = (shape.iter().product::<usize>(), widths.iter().sum::<usize>());
     let mut y = scratch(rows * width);
     let mut at = 0;
@@ -186,6 +200,10 @@ impl Step for Masked {
 }
 
 pub(crate) fn masked(tape: &mut Tape, x: Node, mask: Vec<f32>) -> Result<Node> {
+    if tape.in_graph() {
+        let x = tape.tensor(x)?;
+        return Ok(tape.put((x * Tensor::from_vec(mask, x.shape(), x.device())?)?));
+    }
     let mut y = tape.read(x)?.to_vec();
     act::mul_assign(&mut y, &mask);
     Ok(tape.push(y, tape.shape(x).to_vec(), &[x], &[], Masked { x, mask }))
@@ -246,6 +264,9 @@ pub fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
         return Err(Error::Config { what: "times to repeat", expected: "at least 1", found: "0".into() });
     }
     run(&[x], None, |t, n| {
+        if t.in_graph() {
+            return Ok(t.put(graph::act::repeat_rows(t.tensor(n[0])?, times)?));
+        }
         let mut y = Vec::with_capacity(b * times * width);
         for r in t.read(n[0])?.chunks_exact(width) {
             (0..times).for_each(|_| y.extend_from_slice(r));

@@ -1,3 +1,4 @@
+use crate::graph;
 use crate::kernel::norm::{self, Dims, Post, Saved};
 use crate::params::{Builder, Init, Weight};
 use crate::tape::{Flow, Node, Read, Step, Tape, Values, read, run};
@@ -106,6 +107,20 @@ impl GroupNorm {
         let expected = if post == Post::MishFilm { vec![shape[0], 2 * self.channels] } else { shape.clone() };
         if let Some(o) = other.filter(|o| tape.shape(*o) != expected) {
             return Err(wrong("second input of group norm", format!("{expected:?}"), tape.shape(o)));
+        }
+        if tape.in_graph() {
+            let (gain, bias) = (tape.weight(&self.gain), tape.weight(&self.bias));
+            let z = graph::norm::group_norm(tape.tensor(x)?, &gain, &bias, self.groups)?;
+            let other = other.map(|o| tape.tensor(o)).transpose()?;
+            let y = match (post, other) {
+                (Post::Relu, _) => graph::act::relu(&z)?,
+                (Post::AddRelu, Some(r)) => graph::act::relu(&(z + r)?)?,
+                (Post::Mish, _) => graph::act::mish(&z)?,
+                (Post::MishFilm, Some(e)) => graph::act::film(&graph::act::mish(&z)?, e)?,
+                (Post::MishAdd, Some(r)) => (graph::act::mish(&z)? + r)?,
+                _ => z,
+            };
+            return Ok(tape.put(y));
         }
         let dims = Dims {
             b: shape[0],

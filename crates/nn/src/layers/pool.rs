@@ -1,4 +1,5 @@
 use super::Conv2d;
+use crate::graph;
 use crate::kernel::pool::{self, Map};
 use crate::params::Builder;
 use crate::tape::{Flow, Node, Step, Tape, Values, run};
@@ -32,6 +33,9 @@ impl MaxPool2d {
 
     pub(crate) fn record(self, tape: &mut Tape, x: Node) -> Result<Node> {
         let map = map(tape, x, "max pool input")?;
+        if tape.in_graph() {
+            return Ok(tape.put(graph::pool::max_pool(tape.tensor(x)?, &map)?));
+        }
         let y = pool::max_forward(&tape.read(x)?, &map);
         let p = map.pooled();
         let step = Pooled { x, y: tape.next(), map };
@@ -86,6 +90,9 @@ impl SpatialSoftmax {
     pub(crate) fn record(&self, tape: &mut Tape, x: Node) -> Result<Node> {
         let logits = self.nets.record(tape, x)?;
         let map = map(tape, logits, "spatial softmax input")?;
+        if tape.in_graph() {
+            return Ok(tape.put(graph::pool::keypoints(tape.tensor(logits)?, &map)?));
+        }
         let (out, attention) = pool::keypoints_forward(&tape.read(logits)?, &map);
         let step = Attended { logits, out: tape.next(), attention, map };
         tape.done(logits);

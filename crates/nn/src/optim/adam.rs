@@ -1,5 +1,7 @@
 use crate::grad::Grads;
+use crate::graph;
 use crate::kernel::optim;
+use crate::numbers::{Numbers, elsewhere};
 use crate::params::{Params, edit};
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
@@ -48,8 +50,8 @@ impl Default for AdamConfig {
 pub struct Adam {
     config: AdamConfig,
     params: Params,
-    mean: Vec<Vec<f32>>,
-    square: Vec<Vec<f32>>,
+    mean: Vec<Numbers>,
+    square: Vec<Numbers>,
     steps: u64,
 }
 
@@ -60,7 +62,7 @@ impl Adam {
     /// An optimiser of `params` that has made no step.
     ///
     /// # Errors
-    /// [`Error::Config`] names the first setting that does not work.
+    /// [`Error::Config`] names the first setting that does not work; [`Error::Candle`] when a device fails.
     pub fn new(config: &AdamConfig, params: &Params) -> Result<Self> {
         let fail =
             |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
@@ -77,8 +79,10 @@ impl Adam {
         if let Some(max) = config.clip_norm.filter(|c| c.is_nan() || *c <= 0.0) {
             return fail("clip_norm", "a positive number", max);
         }
-        let zeros: Vec<Vec<f32>> = params.variables().map(|v| vec![0.0; v.elem_count()]).collect();
-        Ok(Self { config: *config, params: params.clone(), mean: zeros.clone(), square: zeros, steps: 0 })
+        let zeros: Result<Vec<Numbers>> =
+            params.variables().map(|v| Numbers::zeros(v, params.in_graph())).collect();
+        let mean = zeros?;
+        Ok(Self { config: *config, params: params.clone(), square: mean.clone(), mean, steps: 0 })
     }
 
     /// How many steps were made.
@@ -102,7 +106,7 @@ impl Adam {
     pub fn step(&mut self, params: &Params, grads: &Grads, lr: f32) -> Result<f32> {
         grads.check(params)?;
         self.check(params)?;
-        let norm = grads.norm();
+        let norm = grads.norm()?;
         if !norm.is_finite() {
             return Ok(norm);
         }
@@ -121,8 +125,15 @@ impl Adam {
         };
         let moments = self.mean.iter_mut().zip(&mut self.square);
         for ((var, g), (m, v)) in params.variables().zip(&grads.list).zip(moments) {
-            if let Some(g) = g {
-                edit(var, |p| optim::adam(p, g, m, v, step))?;
+            match (g, m, v) {
+                (None, _, _) => {}
+                (Some(Numbers::Host(g)), Numbers::Host(m), Numbers::Host(v)) => {
+                    edit(var, |p| optim::adam(p, g, m, v, step))?;
+                }
+                (Some(Numbers::Device(g)), Numbers::Device(m), Numbers::Device(v)) => {
+                    graph::optim::adam(var, g, m, v, step)?;
+                }
+                _ => return Err(elsewhere("gradients", params.len())),
             }
         }
         Ok(norm)
@@ -131,11 +142,11 @@ impl Adam {
     /// Moments as `mean.<name>` and `square.<name>` in PyTorch's layout, and `steps`.
     ///
     /// # Errors
-    /// None at present; other devices will have to copy.
+    /// [`Error::Candle`] when a device fails; none on the CPU.
     pub fn state(&self) -> Result<Weights> {
         let mut out = Weights::new();
         for (prefix, list) in [("mean", &self.mean), ("square", &self.square)] {
-            let named = self.params.all_outward(list).into_iter();
+            let named = self.params.all_outward(list)?.into_iter();
             out.extend(named.map(|(n, t)| (format!("{prefix}.{n}"), t)));
         }
         let data = vec![(self.steps / STEP_BASE) as f32, (self.steps % STEP_BASE) as f32];

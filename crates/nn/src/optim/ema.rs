@@ -1,4 +1,6 @@
+use crate::graph;
 use crate::kernel::optim;
+use crate::numbers::{Numbers, elsewhere};
 use crate::params::{Params, with};
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
@@ -35,7 +37,7 @@ impl EmaConfig {
 pub struct Ema {
     config: EmaConfig,
     params: Params,
-    average: Vec<Vec<f32>>,
+    average: Vec<Numbers>,
     updates: u64,
 }
 
@@ -48,7 +50,7 @@ impl Ema {
     /// # Errors
     /// [`Error::Candle`] when a variable cannot be read.
     pub fn new(config: &EmaConfig, params: &Params) -> Result<Self> {
-        let average: Result<_> = params.variables().map(|v| with(v.as_tensor(), <[f32]>::to_vec)).collect();
+        let average: Result<_> = params.variables().map(|v| Numbers::copy(v, params.in_graph())).collect();
         Ok(Self { config: *config, params: params.clone(), average: average?, updates: 0 })
     }
 
@@ -65,10 +67,16 @@ impl Ema {
         }
         let part = (1.0 - self.config.decay(self.updates)) as f32;
         for (var, a) in params.variables().zip(&mut self.average) {
-            with(
-                var.as_tensor(),
-                |p| if part < 1.0 { optim::blend(a, p, part) } else { a.copy_from_slice(p) },
-            )?;
+            match a {
+                Numbers::Host(a) if !params.in_graph() => with(var.as_tensor(), |p| {
+                    if part < 1.0 { optim::blend(a, p, part) } else { a.copy_from_slice(p) }
+                })?,
+                Numbers::Device(a) if params.in_graph() && part < 1.0 => {
+                    *a = graph::optim::blend(a, &var.as_detached_tensor(), part)?;
+                }
+                a @ Numbers::Device(_) if params.in_graph() => *a = Numbers::copy(var, true)?,
+                _ => return Err(elsewhere("moving average", params.len())),
+            }
         }
         self.updates += 1;
         Ok(())
@@ -77,9 +85,9 @@ impl Ema {
     /// The averaged weights in PyTorch's layout.
     ///
     /// # Errors
-    /// None at present; other devices will have to copy.
+    /// [`Error::Candle`] when a device fails; none on the CPU.
     pub fn weights(&self) -> Result<Weights> {
-        Ok(self.params.all_outward(&self.average))
+        self.params.all_outward(&self.average)
     }
 
     /// How many updates were made.

@@ -1,6 +1,6 @@
 //! Against LeRobot 0.4.4 on torch 2.7.1; see `tests/golden/README.md`.
 
-use crate::support::{Golden, assert_close, filled, loss, values, wide};
+use crate::support::{Golden, assert_close, elsewhere, filled, loss, values, wide};
 use e2h_nn::{ConditionalUnet1d, Mode, RgbEncoder, RgbEncoderConfig, UnetConfig, backward};
 
 fn unet() -> UnetConfig {
@@ -16,6 +16,11 @@ fn unet() -> UnetConfig {
 
 #[test]
 fn unet_output_and_gradients() {
+    unet_as_in_lerobot();
+    elsewhere(unet_as_in_lerobot);
+}
+
+fn unet_as_in_lerobot() {
     let golden = Golden::open("unet1d");
     let (params, net) = filled(Mode::Train, |b| ConditionalUnet1d::new(&unet(), b));
     let steps: Vec<f32> = golden.get("t").1.iter().map(|t| *t as f32).collect();
@@ -29,6 +34,11 @@ fn unet_output_and_gradients() {
 
 #[test]
 fn rgb_encoder_output_and_gradients() {
+    rgb_encoder_as_in_lerobot();
+    elsewhere(rgb_encoder_as_in_lerobot);
+}
+
+fn rgb_encoder_as_in_lerobot() {
     let golden = Golden::open("rgb_encoder");
     let config = RgbEncoderConfig {
         height: 56,
@@ -49,6 +59,11 @@ fn rgb_encoder_output_and_gradients() {
 
 #[test]
 fn without_a_record_the_output_is_the_same() {
+    without_a_record();
+    elsewhere(without_a_record);
+}
+
+fn without_a_record() {
     let golden = Golden::open("unet1d");
     let steps: Vec<f32> = golden.get("t").1.iter().map(|t| *t as f32).collect();
     let (x, cond) = (golden.tensor("x"), golden.tensor("cond"));

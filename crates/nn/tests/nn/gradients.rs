@@ -1,6 +1,8 @@
-//! Every gradient against central finite differences.
+//! Every gradient against central finite differences, and Candle's operations against our kernels.
 
-use crate::support::{assert_close, fill, filled, input, loss, loss64, rng, values};
+use crate::support::{
+    assert_close, compute, elsewhere, fill, filled, input, loss, loss64, rng, values, wide,
+};
 use candle_core::{Device, Tensor, Var};
 use e2h_nn::{
     Act, Builder, ConditionalUnet1d, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d,
@@ -21,6 +23,56 @@ fn shifted(x: &Tensor, i: usize, by: f32) -> Tensor {
     Tensor::from_vec(v, x.dims(), &Device::Cpu).unwrap()
 }
 
+/// The output, the gradients of `inputs` through frozen weights, and those of every parameter.
+fn outcome<T>(
+    inputs: &[Tensor],
+    build: impl Fn(&Builder<'_>) -> Result<T>,
+    forward: impl Fn(&T, &[Tensor]) -> Result<Tensor>,
+) -> (Vec<f32>, Vec<Vec<f32>>, Weights) {
+    let (_, net) = filled(Mode::Infer, &build);
+    let inputs: Vec<Tensor> = inputs.iter().map(|x| x.to_device(compute().device()).unwrap()).collect();
+    let vars: Vec<Var> = inputs.iter().map(|x| Var::from_tensor(x).unwrap()).collect();
+    let tensors: Vec<Tensor> = vars.iter().map(|v| v.as_tensor().clone()).collect();
+    let out = forward(&net, &tensors).unwrap();
+    let store = loss(&out).backward().unwrap();
+    let gradients = vars.iter().map(|v| values(store.get(v.as_tensor()).unwrap())).collect();
+    let (params, net) = filled(Mode::Train, &build);
+    if params.is_empty() {
+        return (values(&out), gradients, Weights::new());
+    }
+    let grads = backward(&loss(&forward(&net, &tensors).unwrap()), &params).unwrap();
+    let plain = backward(&loss(&forward(&net, &inputs).unwrap()), &params).unwrap();
+    let weights = grads.export(&params).unwrap();
+    assert_eq!(weights, plain.export(&params).unwrap(), "with and without a gradient of the inputs");
+    (values(&out), gradients, weights)
+}
+
+/// Candle's operations, which a GPU computes with, against our kernels.
+pub(crate) fn same_through_candle<T>(
+    what: &str,
+    inputs: &[Tensor],
+    tolerance: f64,
+    build: impl Fn(&Builder<'_>) -> Result<T>,
+    forward: impl Fn(&T, &[Tensor]) -> Result<Tensor>,
+) {
+    let (out, gradients, weights) = outcome(inputs, &build, &forward);
+    let (c_out, c_gradients, c_weights) = elsewhere(|| outcome(inputs, &build, &forward));
+    assert_close(&format!("{what} through Candle"), &wide(&c_out), &wide(&out), 1e-5);
+    for (k, (c, g)) in c_gradients.iter().zip(&gradients).enumerate() {
+        assert_close(&format!("{what} through Candle, input {k}"), &wide(c), &wide(g), tolerance);
+    }
+    assert!(c_weights.keys().eq(weights.keys()));
+    for (name, g) in &weights {
+        let (c, g) = (wide(&c_weights[name].data), wide(&g.data));
+        if name.ends_with("nets.bias") {
+            // A softmax does not see a constant: what is left is rounding.
+            assert!(c.iter().chain(&g).all(|v| v.abs() < 1e-4), "{what}, {name}: {c:?} {g:?}");
+            continue;
+        }
+        assert_close(&format!("{what} through Candle, {name}"), &c, &g, tolerance);
+    }
+}
+
 /// Checks the gradients of `inputs`, then of every parameter, of sum(out * s).
 fn check<T>(
     what: &str,
@@ -30,6 +82,7 @@ fn check<T>(
     build: impl Fn(&Builder<'_>) -> Result<T>,
     forward: impl Fn(&T, &[Tensor]) -> Result<Tensor>,
 ) {
+    same_through_candle(what, inputs, 1e-4, &build, &forward);
     // Inputs, through frozen weights.
     let (_, net) = filled(Mode::Infer, &build);
     let vars: Vec<Var> = inputs.iter().map(|x| Var::from_tensor(x).unwrap()).collect();
@@ -271,8 +324,13 @@ fn whole_networks() {
 
 #[test]
 fn mish_is_finite_far_out() {
+    far_out();
+    elsewhere(far_out);
+}
+
+fn far_out() {
     let far = [-1e30f32, -200., -89., -30., 0., 30., 89., 200., 1e30];
-    let v = Var::new(&far, &Device::Cpu).unwrap();
+    let v = Var::new(&far, compute().device()).unwrap();
     let y = Mish.forward(v.as_tensor()).unwrap();
     let g = values(y.sum_all().unwrap().backward().unwrap().get(v.as_tensor()).unwrap());
     assert!(values(&y).iter().chain(&g).all(|v| v.is_finite()), "{:?} {g:?}", values(&y));
@@ -288,6 +346,11 @@ fn mish_is_finite_far_out() {
 /// Two networks in one loss, one used twice.
 #[test]
 fn shared_and_joint_networks() {
+    shared_and_joint();
+    elsewhere(shared_and_joint);
+}
+
+fn shared_and_joint() {
     let (pa, a) = filled(Mode::Train, |b| Linear::new(4, 4, b));
     let (pb, b) = filled(Mode::Train, |b| Linear::new(4, 4, b));
     let input = x(1, &[3, 4]);
@@ -309,7 +372,7 @@ fn shared_and_joint_networks() {
     let part = |i| backward(&loss(&a.forward(&input.narrow(0, i, 1).unwrap()).unwrap()), &pa).unwrap();
     let mut sum = part(0);
     sum.add(&part(1)).unwrap();
-    assert!(sum.norm() > 0.0 && sum.add(&grads[1]).is_ok());
+    assert!(sum.norm().unwrap() > 0.0 && sum.add(&grads[1]).is_ok());
     let (other, _) = Params::build(Mode::Train, &mut rng(0), |b| Linear::new(4, 5, b)).unwrap();
     assert!(sum.export(&other).is_err());
 }

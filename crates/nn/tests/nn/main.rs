@@ -1,6 +1,7 @@
 //! Tests of the layers, the optimisers and the files.
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod candle;
 mod files;
 mod golden;
 mod gradients;

@@ -1,13 +1,14 @@
 //! Optimisers against torch, and their state.
 
-use crate::support::{Golden, assert_close, filled, input, loss, rng, wide};
+use crate::support::{Golden, assert_close, compute, elsewhere, filled, input, loss, rng, wide};
 use e2h_nn::{
     Adam, AdamConfig, Ema, EmaConfig, Linear, LrSchedule, Mode, Params, Weights, backward, learning_rate,
 };
 
 fn near(config: &AdamConfig, name: &str) {
     // p of the reference is the bias of a layer whose input is zero: its output is p.
-    let (params, net) = Params::build(Mode::Train, &mut rng(0), |b| Linear::new(1, 3, b)).unwrap();
+    let (params, net) =
+        Params::build_on(&compute(), Mode::Train, &mut rng(0), |b| Linear::new(1, 3, b)).unwrap();
     let mut w = params.export().unwrap();
     w.get_mut("weight").unwrap().data.fill(0.0);
     w.get_mut("bias").unwrap().data.copy_from_slice(&[1.0, -2.0, 3.0]);
@@ -27,6 +28,11 @@ fn near(config: &AdamConfig, name: &str) {
 
 #[test]
 fn adam_as_in_torch() {
+    as_in_torch();
+    elsewhere(as_in_torch);
+}
+
+fn as_in_torch() {
     let plain =
         AdamConfig { lr: 2e-2, beta1: 0.9, weight_decay: 0.0, clip_norm: None, ..AdamConfig::default() };
     near(&plain, "adam");
@@ -62,6 +68,11 @@ fn some_steps(params: &Params, net: &Linear, adam: &mut Adam, ema: &mut Ema, ste
 /// Stopping, saving and going on gives the same bytes as not stopping.
 #[test]
 fn state_resumes() {
+    resumes();
+    elsewhere(resumes);
+}
+
+fn resumes() {
     let build = || {
         let (params, net) = filled(Mode::Train, |b| Linear::new(4, 5, b));
         let adam = Adam::new(&AdamConfig::default(), &params).unwrap();
@@ -87,6 +98,11 @@ fn state_resumes() {
 
 #[test]
 fn ema_starts_at_the_weights_and_follows() {
+    ema_follows();
+    elsewhere(ema_follows);
+}
+
+fn ema_follows() {
     let (params, _) = filled(Mode::Train, |b| Linear::new(1, 1, b));
     let mut ema = Ema::new(&EmaConfig::default(), &params).unwrap();
     let mut want = 0.0;
@@ -103,6 +119,11 @@ fn ema_starts_at_the_weights_and_follows() {
 
 #[test]
 fn a_gradient_that_is_not_finite_changes_nothing() {
+    not_finite();
+    elsewhere(not_finite);
+}
+
+fn not_finite() {
     let (params, net) = filled(Mode::Train, |b| Linear::new(4, 5, b));
     let before = params.export().unwrap();
     let mut adam = Adam::new(&AdamConfig::default(), &params).unwrap();

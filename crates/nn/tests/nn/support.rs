@@ -1,10 +1,42 @@
 //! The numbers that stand in for weights and inputs, and comparisons.
 
-use candle_core::{Device, Tensor};
-use e2h_nn::{Builder, HostTensor, Mode, Params, Result, Weights};
+use candle_core::Tensor;
+use e2h_nn::{Builder, Compute, HostTensor, Mode, Params, Precision, Result, Weights, candle_operations};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 use safetensors::SafeTensors;
+use std::cell::Cell;
+
+thread_local! {
+    static ELSEWHERE: Cell<bool> = const { Cell::new(false) };
+}
+
+/// The device that `E2H_TEST_DEVICE` names, opened once.
+fn named() -> Option<&'static Compute> {
+    static OPENED: std::sync::OnceLock<Option<Compute>> = std::sync::OnceLock::new();
+    let open = || {
+        let name = std::env::var("E2H_TEST_DEVICE").ok()?;
+        Some(Compute::open(&name, Precision::default()).unwrap_or_else(|e| panic!("{e}")))
+    };
+    OPENED.get_or_init(open).as_ref()
+}
+
+/// Where tensors and networks are made now.
+pub(crate) fn compute() -> Compute {
+    named().filter(|_| ELSEWHERE.get()).cloned().unwrap_or_default()
+}
+
+/// Runs `f` on Candle's operations: on the device that `E2H_TEST_DEVICE` names (`benches/cuda/run.sh`), else on the CPU.
+pub(crate) fn elsewhere<R>(f: impl FnOnce() -> R) -> R {
+    struct Restore(bool);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            ELSEWHERE.set(self.0);
+        }
+    }
+    let _restore = Restore(ELSEWHERE.replace(true));
+    if named().is_some() { f() } else { candle_operations(f) }
+}
 
 pub(crate) fn s(k: u64, n: usize) -> impl Iterator<Item = f64> {
     (0..n as u64).map(move |i| (0.7 * ((i * 7919 + k * 104_729) % 10_007) as f64 + 0.3).sin())
@@ -28,12 +60,12 @@ pub(crate) fn fill(like: &Weights) -> Weights {
 /// A tensor of s(k) times `scale` plus `shift`.
 pub(crate) fn input(k: u64, shape: &[usize], scale: f64, shift: f64) -> Tensor {
     let data: Vec<f32> = s(k, shape.iter().product()).map(|v| (v * scale + shift) as f32).collect();
-    Tensor::from_vec(data, shape, &Device::Cpu).unwrap()
+    Tensor::from_vec(data, shape, compute().device()).unwrap()
 }
 
 /// A network with filled weights.
 pub(crate) fn filled<T>(mode: Mode, f: impl FnOnce(&Builder<'_>) -> Result<T>) -> (Params, T) {
-    let (params, net) = Params::build(mode, &mut rng(0), f).unwrap();
+    let (params, net) = Params::build_on(&compute(), mode, &mut rng(0), f).unwrap();
     params.import(&fill(&params.export().unwrap())).unwrap();
     (params, net)
 }
@@ -85,7 +117,8 @@ pub(crate) struct Golden(Vec<u8>);
 
 impl Golden {
     pub(crate) fn open(name: &str) -> Self {
-        let path = format!("{}/../../tests/golden/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
+        // Tests run in the folder of their package, wherever they were built.
+        let path = format!("../../tests/golden/{name}.safetensors");
         Self(std::fs::read(&path).unwrap_or_else(|e| panic!("{path}: {e}")))
     }
 
@@ -114,7 +147,7 @@ impl Golden {
     pub(crate) fn tensor(&self, name: &str) -> Tensor {
         let (shape, data) = self.get(name);
         let data: Vec<f32> = data.iter().map(|v| *v as f32).collect();
-        Tensor::from_vec(data, shape, &Device::Cpu).unwrap()
+        Tensor::from_vec(data, shape, compute().device()).unwrap()
     }
 
     /// Compares sum, sum of squares and first 16 numbers of every gradient. The sum is measured against what its terms

@@ -8,7 +8,7 @@ use super::{ACTION, CONFIG_FILE, ENVIRONMENT, POSITION_GRID, STATE, WEIGHTS_FILE
 use crate::model::{DiffusionModel, Widths};
 use crate::{Ddim, Error, ImageScaling, PolicyConfig, Prediction, Result, SamplerKind};
 use e2h_core::stream;
-use e2h_nn::Mode;
+use e2h_nn::{Compute, Mode};
 use std::path::Path;
 
 /// Opens a diffusion policy that LeRobot 0.4.4 or [`super::export`] wrote.
@@ -55,7 +55,7 @@ pub fn import(dir: &Path) -> Result<LerobotPolicy> {
     }
 
     let widths = Widths { state: s + e, action: a };
-    let model = DiffusionModel::of_widths(&config, widths, Mode::Infer, &mut stream(0, "weights", 0, 0))?;
+    let model = DiffusionModel::of_widths(&Compute::cpu(), &config, widths, Mode::Infer, &mut stream(0, "weights", 0, 0))?;
     let weights_path = dir.join(WEIGHTS_FILE);
     let (mut weights, metadata) = e2h_nn::load_weights(&weights_path)?;
     weights.retain(|name, _| !name.ends_with(POSITION_GRID));

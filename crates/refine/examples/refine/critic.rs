@@ -144,6 +144,7 @@ impl Stage {
         let (critic, report) = train_critic(
             &network,
             &training,
+            &e2h_nn::Compute::cpu(),
             &normaliser,
             &none,
             &rollouts,

@@ -1,0 +1,52 @@
+use crate::params::{host, with};
+use crate::{Error, Result};
+use candle_core::{Tensor, Var};
+use std::borrow::Cow;
+
+/// A gradient, a moment or an average of one parameter, in its layout and where it is.
+#[derive(Clone, Debug)]
+pub(crate) enum Numbers {
+    Host(Vec<f32>),
+    Device(Tensor),
+}
+
+impl Numbers {
+    /// `data` beside `var`; `graph` as in [`crate::Params`].
+    pub(crate) fn new(data: Vec<f32>, var: &Var, graph: bool) -> Result<Self> {
+        if !graph {
+            return Ok(Self::Host(data));
+        }
+        Ok(Self::Device(Tensor::from_vec(data, var.shape(), var.device())?))
+    }
+
+    pub(crate) fn zeros(var: &Var, graph: bool) -> Result<Self> {
+        if graph { Ok(Self::Device(var.zeros_like()?)) } else { Ok(Self::Host(vec![0.0; var.elem_count()])) }
+    }
+
+    /// The present numbers of `var`.
+    pub(crate) fn copy(var: &Var, graph: bool) -> Result<Self> {
+        if graph {
+            return Ok(Self::Device(var.as_detached_tensor().force_contiguous()?));
+        }
+        with(var.as_tensor(), |v| Self::Host(v.to_vec()))
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        match self {
+            Self::Host(v) => v.len(),
+            Self::Device(t) => t.elem_count(),
+        }
+    }
+
+    pub(crate) fn host(&self) -> Result<Cow<'_, [f32]>> {
+        match self {
+            Self::Host(v) => Ok(Cow::Borrowed(v)),
+            Self::Device(t) => Ok(Cow::Owned(host(t)?)),
+        }
+    }
+}
+
+/// Numbers of a network elsewhere.
+pub(crate) fn elsewhere(what: &'static str, parameters: usize) -> Error {
+    Error::OtherParams { what, expected: parameters, found: parameters }
+}

@@ -6,6 +6,7 @@
 #![allow(clippy::expect_used, reason = "a bench that cannot be set up should stop")]
 #![allow(missing_docs, reason = "criterion's macros make undocumented items")]
 
+#[allow(dead_code, reason = "the peer example uses the rest")]
 #[path = "peers/workload.rs"]
 mod workload;
 

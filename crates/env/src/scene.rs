@@ -33,7 +33,9 @@ pub fn compose(bodies: &str, camera: &TableCamera) -> String {
 /// contact sinks in by about its speed times its time constant over e, and the time constant may not be below two steps.
 #[must_use]
 pub fn finer(scene: &str) -> String {
-    scene.replace(r#"timestep="0.002""#, r#"timestep="0.001""#).replace(r#"solref="0.004 1""#, r#"solref="0.002 1""#)
+    scene
+        .replace(r#"timestep="0.002""#, r#"timestep="0.001""#)
+        .replace(r#"solref="0.004 1""#, r#"solref="0.002 1""#)
 }
 
 /// A scene of two arms without grippers, with tools (MJCF elements of the hand's body, where z points out of the flange)

@@ -184,8 +184,7 @@ impl Directory {
             std::fs::remove_dir_all(&beside).map_err(io("removing", &beside))?;
         }
         if let Some(first) = episodes.first() {
-            let mut writer =
-                Writer::create(&beside, e2h_core::CONTROL_HZ, Some(ROBOT), features_of(first))?;
+            let mut writer = Writer::create(&beside, e2h_core::CONTROL_HZ, Some(ROBOT), features_of(first))?;
             for episode in episodes {
                 writer.push_episode(episode)?;
             }
@@ -204,7 +203,8 @@ impl Directory {
             return Ok(Some((vec![], notes)));
         }
         let dataset = Dataset::open(root)?;
-        let episodes = (0..dataset.len()).map(|i| dataset.read_episode(i)).collect::<std::result::Result<_, _>>()?;
+        let episodes =
+            (0..dataset.len()).map(|i| dataset.read_episode(i)).collect::<std::result::Result<_, _>>()?;
         Ok(Some((episodes, notes)))
     }
 }

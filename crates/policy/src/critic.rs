@@ -47,8 +47,7 @@ impl Critic {
         let mut condition = None;
         let (params, head) =
             Params::build_on(compute, mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
-                condition =
-                    Some(ConditionEncoder::new(&config, config.state_features(), &b.pp("diffusion")));
+                condition = Some(ConditionEncoder::new(&config, config.state_features(), &b.pp("diffusion")));
                 Mlp::new(&dims, critic.dropout, &b.pp("head"))
             })?;
         let condition =

@@ -55,7 +55,13 @@ pub fn import(dir: &Path) -> Result<LerobotPolicy> {
     }
 
     let widths = Widths { state: s + e, action: a };
-    let model = DiffusionModel::of_widths(&Compute::cpu(), &config, widths, Mode::Infer, &mut stream(0, "weights", 0, 0))?;
+    let model = DiffusionModel::of_widths(
+        &Compute::cpu(),
+        &config,
+        widths,
+        Mode::Infer,
+        &mut stream(0, "weights", 0, 0),
+    )?;
     let weights_path = dir.join(WEIGHTS_FILE);
     let (mut weights, metadata) = e2h_nn::load_weights(&weights_path)?;
     weights.retain(|name, _| !name.ends_with(POSITION_GRID));

@@ -37,7 +37,7 @@ fn nut_assembly_runs_from_nothing_and_its_checkpoint_evaluates() {
     let output = example("view").arg(&out).arg("--out").arg(&page).output().unwrap();
     assert_success(&output);
     let html = std::fs::read_to_string(&page).unwrap();
-    let demonstrations = std::fs::read_dir(out.join("demonstrations")).unwrap().count() - 1; // notes.json
+    let demonstrations = auto_e2h::data::lerobot::Dataset::open(out.join("demonstrations")).unwrap().len();
     assert_eq!(html.matches("data-origin=\"demonstration\"").count(), demonstrations);
     assert!(out.join("iteration_01/reversals.json").exists());
 

@@ -52,7 +52,9 @@ fn results(dir: &Path) -> Vec<(PathBuf, Vec<u8>)> {
             let path = entry.path();
             if path.is_dir() {
                 folders.push(path);
-            } else if path.extension().is_some_and(|e| e == "safetensors" || e == "svg" || e == "toml")
+            } else if path
+                .extension()
+                .is_some_and(|e| e == "safetensors" || e == "parquet" || e == "svg" || e == "toml")
                 || path.ends_with("policy.json")
             {
                 let bytes = std::fs::read(&path).expect("a file");

@@ -129,7 +129,8 @@ fn what_ends_one_task_starts_the_other_and_is_not_its_goal() {
                 let lies = env.sim().object().position;
                 env.home().unwrap();
                 let moved = (env.sim().object().position - lies).norm();
-                assert!(moved < 1e-3, "{name} {direction}: homing moved the object by {moved}");
+                // A brush that leans settles a little further as the hand leaves.
+                assert!(moved < 2.5e-3, "{name} {direction}: homing moved the object by {moved}");
                 // Those of the easy task are what a sloppier hand than the demonstrator's leaves.
                 assert!(
                     env.success(direction.reverse()),

@@ -3,8 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::print_stdout, reason = "a test")]
 
 use e2h_core::{Direction, Episode, Frames, Kind, Observation, Origin, Outcome};
-use e2h_data::EpisodeStore;
-use e2h_data::lerobot::{Column, Dtype, Feature, Table, Writer};
+use e2h_data::lerobot::{Column, Dtype, Feature, Table, Writer, features_of};
 use e2h_learn::RunConfig;
 use e2h_learn::record::{Collection, Evaluation, IterationRecord, Reversal, wilson95};
 use e2h_learn::view::{Options, write, write_scalars};
@@ -126,21 +125,21 @@ fn run(dir: &Path) -> Vec<Episode> {
     let put = |name: &str, text: String| std::fs::write(dir.join(name), text).unwrap();
     let config = RunConfig::resolve("smoke", "nut_assembly", &[]).unwrap();
     std::fs::create_dir_all(dir.join("iteration_01")).unwrap();
-    put("run.json", r#"{"format":1,"task":"nut_assembly","preset":"smoke","seed":3}"#.to_owned());
+    put("run.json", r#"{"format":2,"task":"nut_assembly","preset":"smoke","seed":3}"#.to_owned());
     put("config.toml", config.text);
-    let store = EpisodeStore::open(dir.join("demonstrations")).unwrap();
-    for i in 0..3 {
-        store.write(&format!("{i:05}"), &episode(i, 60, 24)).unwrap();
-    }
+    let store = |folder: &str, episodes: &[Episode]| {
+        let mut writer =
+            Writer::create(dir.join(folder), 20.0, Some("panda"), features_of(&episodes[0])).unwrap();
+        episodes.iter().for_each(|e| writer.push_episode(e).unwrap());
+        writer.finish().unwrap();
+    };
+    store("demonstrations", &[0, 1, 2].map(|i| episode(i, 60, 24)));
     let mut rollout = episode(4, 90, 24);
     (rollout.origin.kind, rollout.origin.iteration) = (Kind::Rollout, 1);
     let reversed = reverse(&rollout, &ReverseConfig::default());
     let refined = kinematic_filter(&reversed, &KinematicConfig::default(), &ReverseConfig::default());
     assert!(!refined.segments.is_empty());
-    let store = EpisodeStore::open(dir.join("iteration_01/segments")).unwrap();
-    for (i, segment) in refined.segments.iter().enumerate() {
-        store.write(&format!("{i:05}"), segment).unwrap();
-    }
+    store("iteration_01/segments", &refined.segments);
     let mut account = Reversal::new(&reversed, &refined);
     account.value = Some((0..90).map(|t| (t % 7 != 0).then_some(t as f32 / 90.0)).collect());
     put("iteration_01/reversals.json", serde_json::to_string(&[account]).unwrap());
@@ -275,13 +274,16 @@ fn what_cannot_be_read_is_told() {
     let zero = Options { episodes: 0, ..Options::default() };
     assert!(write(dir.path(), &out, &zero).unwrap_err().to_string().contains("at least 1"));
 
-    // One broken file does not take the others' place.
-    run(dir.path());
-    std::fs::write(dir.path().join("demonstrations/00001.safetensors"), "torn").unwrap();
+    // One broken dataset does not take the others' place.
+    let segments = run(dir.path()).len();
+    std::fs::write(dir.path().join("demonstrations/data/chunk-000/file-000.parquet"), "torn").unwrap();
     let written = write(dir.path(), &out, &Options::default()).unwrap();
     let html = std::fs::read_to_string(&out).unwrap();
-    assert!(html.contains("cannot be read") && html.contains("00001.safetensors"));
-    assert!(written.left_out.iter().any(|l| l.starts_with("1 episodes cannot be read")));
+    assert!(html.contains("cannot be read") && html.contains("file-000.parquet"));
+    assert!(
+        written.episodes == segments
+            || written.left_out.iter().any(|l| l.starts_with("3 episodes cannot be read"))
+    );
     assert_eq!(entries(&assert_self_contained(&html)), written.episodes);
 
     let root = dir.path().join("data");

@@ -9,7 +9,7 @@ use crate::record::{IterationRecord, Reversal, RunResults};
 use crate::report::{chart, svg::escape};
 use crate::{Error, Result};
 use e2h_core::CONTROL_HZ;
-use e2h_data::EpisodeStore;
+use e2h_data::lerobot::Dataset;
 use e2h_refine::kinematic_filter;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -19,7 +19,7 @@ const DEMONSTRATIONS: &str = "demonstrations";
 pub(super) struct RunSource {
     pub(super) listed: Vec<Listed>,
     /// Folder and name of each episode.
-    places: Vec<(String, String)>,
+    places: Vec<(String, usize)>,
     dir: Directory,
     identity: Identity,
     /// The configuration, or why it cannot be read.
@@ -79,19 +79,27 @@ impl RunSource {
         if !path.is_dir() {
             return Ok(());
         }
-        let store = EpisodeStore::open(&path)?;
-        for name in store.names()? {
-            // A file that is not whole is told on the page, when it is read.
-            let rows = store.summary(&name).map_or(0, |s| s.rows);
-            self.listed.push(Listed { name: format!("{folder}/{name}"), rows });
-            self.places.push((folder.to_owned(), name));
+        if !path.join("meta").exists() {
+            return Ok(()); // nothing was learned from
+        }
+        // A dataset that is not whole is told on the page; the others have their place.
+        let dataset = match Dataset::open(&path) {
+            Ok(dataset) => dataset,
+            Err(e) => {
+                self.notes.push(format!("{folder} cannot be read: {e}"));
+                return Ok(());
+            }
+        };
+        for (i, span) in dataset.episodes().iter().enumerate() {
+            self.listed.push(Listed { name: format!("{folder}/{i:05}"), rows: span.length });
+            self.places.push((folder.to_owned(), i));
         }
         Ok(())
     }
 
     pub(super) fn read(&self, index: usize) -> Result<Recording> {
-        let (folder, name) = &self.places[index];
-        let episode = EpisodeStore::open(self.dir.join(folder))?.read(name)?;
+        let (folder, episode) = &self.places[index];
+        let episode = Dataset::open(self.dir.join(folder))?.read_episode(*episode)?;
         let mut account = self.reversals.get(&(folder.clone(), episode.origin.episode)).cloned();
         let mut own = false;
         if let (DEMONSTRATIONS, Ok(c)) = (folder.as_str(), &self.config)

@@ -181,7 +181,7 @@ fn spread(count: usize, wanted: usize) -> Vec<usize> {
 /// run, and length and success by episode for a dataset. `wall_time` is when it was made, s since 1970.
 ///
 /// # Errors
-/// As [`write`]; also when an episode cannot be read.
+/// As [`write()`]; also when an episode cannot be read.
 pub fn write_scalars(dir: &Path, out: &Path, wall_time: f64) -> Result<usize> {
     match Source::open(dir, &Options::default())? {
         Source::Dataset(d) => scalars::dataset(&d, out, wall_time),

@@ -14,38 +14,53 @@ use toml::{Table, Value};
 pub(super) fn files(publication: &Publication) -> Result<Files> {
     let dir = &publication.dir;
     let (checkpoint, _) = Checkpoint::read(dir)?;
-    let results = results(dir)?;
+    let measured = results(dir)?;
+    // Curve and table are of the run that made this policy; those of other seeds go along in the file.
+    let p = &checkpoint.provenance;
+    let own =
+        measured.as_ref().and_then(|(runs, _)| runs.iter().find(|r| r.task == p.task && r.seed == p.seed));
     let read = |name| {
         let path = dir.join(name);
         Ok((name, std::fs::read(&path).map_err(io("reading", &path))?))
     };
     let mut files: Files =
         ["policy.json", "model.safetensors"].into_iter().map(read).collect::<Result<_>>()?;
-    let own = read_if_there(&dir.join("README.md"))?.filter(|t| t.starts_with("---\n"));
-    let card = own.unwrap_or_else(|| {
-        let license = publication.license.as_deref();
-        model_card(&publication.address, &checkpoint.provenance, results.as_ref(), license)
-    });
+    let card = read_if_there(&dir.join("README.md"))?.filter(|t| t.starts_with("---\n"));
+    let card =
+        card.unwrap_or_else(|| model_card(&publication.address, p, own, publication.license.as_deref()));
     files.push(("README.md", card.into_bytes()));
-    if let Some(results) = &results {
-        files.push(("curve.svg", chart::success_curve(&[results]).into_bytes()));
-        let text = serde_json::to_string_pretty(results).map_err(|e| Error::Config(e.to_string()))?;
-        files.push(("results.json", (text + "\n").into_bytes()));
+    if let Some(own) = own {
+        files.push(("curve.svg", chart::success_curve(&[own]).into_bytes()));
+    }
+    if let Some((_, text)) = measured {
+        files.push(("results.json", text.into_bytes()));
     }
     Ok(files)
 }
 
-/// What the run measured: beside the checkpoint, or where a run directory has it. Results of another run do not count.
-fn results(dir: &Path) -> Result<Option<RunResults>> {
+/// A `results.json`: of one run, or of several seeds as our checkpoints have it.
+#[derive(serde::Deserialize)]
+struct Several {
+    runs: Vec<RunResults>,
+}
+
+/// What was measured, and the text that says so: beside the checkpoint, or where a run directory has it.
+fn results(dir: &Path) -> Result<Option<(Vec<RunResults>, String)>> {
     for path in [dir.join("results.json"), dir.join("../../results.json")] {
-        if let Some(text) = read_if_there(&path)? {
-            return serde_json::from_str(&text).map(Some).map_err(|e| Error::Foreign {
-                path,
-                quantity: "file".to_owned(),
-                expected: "results of a run of this version".to_owned(),
-                found: e.to_string(),
-            });
-        }
+        let Some(text) = read_if_there(&path)? else { continue };
+        let several = serde_json::from_str::<serde_json::Value>(&text).is_ok_and(|v| v.get("runs").is_some());
+        let runs = if several {
+            serde_json::from_str::<Several>(&text).map(|s| s.runs)
+        } else {
+            serde_json::from_str(&text).map(|run| vec![run])
+        };
+        let runs = runs.map_err(|e| Error::Foreign {
+            path,
+            quantity: "file".to_owned(),
+            expected: "results of runs of this version".to_owned(),
+            found: e.to_string(),
+        })?;
+        return Ok(Some((runs, text)));
     }
     Ok(None)
 }

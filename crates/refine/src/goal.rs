@@ -17,11 +17,14 @@ pub struct GoalConfig {
     pub enabled: bool,
     /// A reversal must end at most as far from the mean demonstrated goal as this share of the demonstrations do; percent.
     pub percentile: f64,
+    /// Nearer than this every goal is accepted, m: where a hole hardly lets the object move, the share alone would reject nearly
+    /// all, and nothing can drift.
+    pub least: f64,
 }
 
 impl Default for GoalConfig {
     fn default() -> Self {
-        Self { enabled: false, percentile: 50.0 }
+        Self { enabled: false, percentile: 50.0, least: 0.005 }
     }
 }
 
@@ -42,7 +45,8 @@ impl Goal {
         let mean = |axis: usize| ends.iter().map(|e| e[axis]).sum::<f32>() / ends.len() as f32;
         let centre = [mean(0), mean(1), mean(2)];
         let distances: Vec<f64> = ends.iter().map(|e| distance(e, &centre)).collect();
-        Some(Self { centre, radius: percentile(&distances, config.percentile)? })
+        let radius = percentile(&distances, config.percentile)?.max(config.least);
+        Some(Self { centre, radius })
     }
 
     /// How far from the centre `episode` leaves its object, m; none for an episode without rows.
@@ -85,7 +89,7 @@ mod tests {
 
     #[test]
     fn goals_as_near_as_half_of_the_demonstrations_pass() {
-        let config = GoalConfig { enabled: true, percentile: 50.0 };
+        let config = GoalConfig { enabled: true, percentile: 50.0, least: 0.0 };
         let goal = Goal::fit(&boxed(&[0.1, 0.2, 0.3, 0.4, 0.5]), &config).unwrap();
         assert!((goal.centre[0] - 0.3).abs() < 1e-6 && (goal.radius - 0.1).abs() < 1e-6);
         assert!(goal.accepts(&ending(0.39)) && goal.accepts(&ending(0.21)));
@@ -94,9 +98,16 @@ mod tests {
     }
 
     #[test]
+    fn a_hole_that_holds_the_object_does_not_starve_the_gate() {
+        let config = GoalConfig { enabled: true, percentile: 50.0, least: 0.005 };
+        let goal = Goal::fit(&boxed(&[0.1, 0.1001, 0.1002]), &config).unwrap();
+        assert!(goal.accepts(&ending(0.1045)) && !goal.accepts(&ending(0.1055)));
+    }
+
+    #[test]
     fn all_demonstrations_pass_at_a_hundred_percent() {
         let all = boxed(&[0.1, 0.25, 0.9]);
-        let goal = Goal::fit(&all, &GoalConfig { enabled: true, percentile: 100.0 }).unwrap();
+        let goal = Goal::fit(&all, &GoalConfig { enabled: true, percentile: 100.0, least: 0.0 }).unwrap();
         assert!(all.iter().all(|e| goal.accepts(e)));
         let none: Vec<Arc<Episode>> = vec![];
         assert_eq!(Goal::fit(&none, &GoalConfig::default()), None);

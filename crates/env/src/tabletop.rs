@@ -1,7 +1,7 @@
 //! What the pairs at one table share: start regions and the pieces of their predicates.
 
 use crate::Sim;
-use crate::expert::draw;
+use crate::expert::{draw, gauss};
 use e2h_core::{Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};
 use rand::Rng as _;
@@ -37,6 +37,31 @@ impl Region {
 pub(crate) fn in_disk(rng: &mut Rng, radius: f64) -> Vector3<f64> {
     let (r, angle) = (radius * rng.random::<f64>().sqrt(), TAU * rng.random::<f64>());
     Vector3::new(r * angle.cos(), r * angle.sin(), 0.0)
+}
+
+/// A number of the range -1 to 1, as somebody hits it who aims at 0: normal with a third as its deviation.
+fn aimed(rng: &mut Rng) -> f64 {
+    loop {
+        let x = gauss(rng, 1.0 / 3.0);
+        if x.abs() <= 1.0 {
+            return x;
+        }
+    }
+}
+
+/// An angle within `most` of 0, rad, that was aimed at 0.
+pub(crate) fn near_straight(rng: &mut Rng, most: f64) -> f64 {
+    most * aimed(rng)
+}
+
+/// A point of a disk at whose middle was aimed: all of the disk is covered, its edge seldom.
+pub(crate) fn near_middle(rng: &mut Rng, radius: f64) -> Vector3<f64> {
+    loop {
+        let p = Vector3::new(aimed(rng), aimed(rng), 0.0);
+        if p.norm() <= 1.0 {
+            return p * radius;
+        }
+    }
 }
 
 /// A rotation about the vertical.

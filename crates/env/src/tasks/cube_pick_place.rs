@@ -2,7 +2,7 @@
 
 use crate::expert::{draw, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
-use crate::tabletop::{Region, beside, in_disk, left_alone, tilt, turn};
+use crate::tabletop::{Region, beside, left_alone, near_middle, tilt, turn};
 use crate::task::{Choice, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
@@ -94,7 +94,7 @@ impl Task for CubePickPlace {
     fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng) -> Result<()> {
         let position = match direction {
             Direction::Hard => START.draw(rng, HALF),
-            Direction::Easy => seat() + in_disk(rng, 0.95 * SEAT.0),
+            Direction::Easy => seat() + near_middle(rng, 0.95 * SEAT.0),
         };
         sim.set_object(&Pose::new(position, turn(draw(rng, [-FRAC_PI_4, FRAC_PI_4]))))
     }

@@ -2,7 +2,7 @@
 
 use crate::expert::{draw, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place, yaw_of};
-use crate::tabletop::{Region, beside, in_disk, left_alone, tilt, turn};
+use crate::tabletop::{Region, beside, left_alone, near_middle, tilt, turn};
 use crate::task::{Choice, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
@@ -94,7 +94,7 @@ impl Task for CubeStack {
         sim.set_body("base", &base)?;
         let position = match direction {
             Direction::Hard => START.draw(rng, HALF),
-            Direction::Easy => base.position + in_disk(rng, OFF_MIDDLE) + Vector3::new(0.0, 0.0, 2.0 * HALF),
+            Direction::Easy => base.position + near_middle(rng, OFF_MIDDLE) + Vector3::new(0.0, 0.0, 2.0 * HALF),
         };
         sim.set_object(&Pose::new(position, turn(draw(rng, [-FRAC_PI_4, FRAC_PI_4]))))
     }

@@ -2,7 +2,7 @@
 
 use crate::expert::{draw, gauss, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place, yaw_of};
-use crate::tabletop::{Region, beside, in_disk, left_alone, tilt, turn};
+use crate::tabletop::{Region, beside, left_alone, near_middle, near_straight, tilt, turn};
 use crate::task::{Choice, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
@@ -85,11 +85,13 @@ impl Task for Mouse {
     }
 
     fn place(&self, direction: Direction, sim: &mut Sim, rng: &mut Rng) -> Result<()> {
-        let (position, most) = match direction {
-            Direction::Hard => (START.draw(rng, HALF[2]), START_YAW),
-            Direction::Easy => (seat() + in_disk(rng, 0.95 * ON_PAD.0), 0.95 * ON_PAD.1),
+        let (position, yaw) = match direction {
+            Direction::Hard => (START.draw(rng, HALF[2]), draw(rng, [-START_YAW, START_YAW])),
+            Direction::Easy => {
+                (seat() + near_middle(rng, 0.95 * ON_PAD.0), near_straight(rng, 0.95 * ON_PAD.1))
+            }
         };
-        sim.set_object(&Pose::new(position, turn(draw(rng, [-most, most]))))
+        sim.set_object(&Pose::new(position, turn(yaw)))
     }
 
     fn success(&self, direction: Direction, sim: &Sim) -> bool {

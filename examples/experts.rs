@@ -1,16 +1,20 @@
-//! How well do the scripted demonstrators do, and do reversed demonstrations of the easy task replay in the hard one?
+//! Is every task pair sound? Scripted demonstrators in both directions, reversed demonstrations replayed, policies that do
+//! not look, starts, contacts and speed.
 //!
 //!     cargo run --release --example experts -- --all --trials 100
 //!
-//! About half a minute a variant on two cores. `--json` prints one line a variant and nothing else.
+//! About a minute a pair on two cores. `--json` prints one line a variant and nothing else.
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::Result;
 use clap::Parser;
-use e2h_core::{Direction, Episode, Origin, stream};
-use e2h_env::{Env, EnvConfig, Task, TaskOptions, demonstrate, registry, replay, task, variants};
+use e2h_core::{Direction, Episode, Origin, Outcome, stream};
+use e2h_env::{
+    Blind, Env, EnvConfig, Task, TaskOptions, demonstrate, probe, registry, replay, task, variants,
+};
 use e2h_refine::{ReverseConfig, reverse};
 use std::sync::Arc;
+use std::time::Instant;
 
 #[derive(Parser)]
 struct Arguments {
@@ -23,7 +27,7 @@ struct Arguments {
     /// With --all: every variant of each pair, not only the default one.
     #[arg(long, requires = "all")]
     variants: bool,
-    /// Trials of each of the three figures.
+    /// Trials of each figure.
     #[arg(long, default_value_t = 100)]
     trials: u32,
     #[arg(long, default_value_t = 42)]
@@ -35,13 +39,42 @@ struct Arguments {
     json: bool,
 }
 
-/// Successes, and the lengths of the two kinds of demonstrations.
+const BOTH: [Direction; 2] = [Direction::Hard, Direction::Easy];
+/// Control steps for which a random goal is kept: half of the trials tremble, half sweep.
+const HOLDS: [usize; 2] = [1, 20];
+/// Side of the images for which the speed is measured, pixels, and the control steps.
+const SPEED: (usize, usize) = (72, 400);
+
+/// Counts over the trials; pairs are of the hard and the easy direction.
 #[derive(Default)]
 struct Count {
-    hard: u32,
-    easy: u32,
+    experts: [u32; 2],
     replay: u32,
+    /// Starts that are no goal of theirs and one of the other direction's.
+    starts: [u32; 2],
+    still: [u32; 2],
+    random: [u32; 2],
+    diverged: u32,
+    through_table: u32,
+    /// Of blind policies, m.
+    deepest: f64,
     rows: [usize; 2],
+}
+
+impl Count {
+    fn add(&mut self, other: &Self) {
+        for d in 0..2 {
+            self.experts[d] += other.experts[d];
+            self.starts[d] += other.starts[d];
+            self.still[d] += other.still[d];
+            self.random[d] += other.random[d];
+            self.rows[d] += other.rows[d];
+        }
+        self.replay += other.replay;
+        self.diverged += other.diverged;
+        self.through_table += other.through_table;
+        self.deepest = self.deepest.max(other.deepest);
+    }
 }
 
 fn main() -> Result<()> {
@@ -53,45 +86,62 @@ fn main() -> Result<()> {
             registry().iter().flat_map(|t| variants(t).iter().map(move |v| format!("{t}:{v}"))).collect()
         }
     };
+    let n = arguments.trials;
     if !arguments.json {
-        println!(
-            "{:<22} {:>7} {:>12} {:>12} {:>16}",
-            "task", "trials", "hard expert", "easy expert", "reversed replay"
-        );
+        println!("of {n} trials, hard/easy     experts  replay   starts  still  random  deepest contact  steps/s");
     }
     for name in &names {
-        let count = measure(name, &arguments)?;
-        let Count { hard, easy, replay, rows } = count;
-        let n = arguments.trials;
+        let (c, speed) = measure(name, &arguments)?;
         if arguments.json {
             let line = serde_json::json!({
-                "task": name, "trials": n, "hard_expert": hard, "easy_expert": easy, "reversed_replay": replay,
-                "mean_rows_hard": rows[0] / n.max(1) as usize, "mean_rows_easy": rows[1] / n.max(1) as usize,
+                "task": name, "trials": n, "seed": arguments.seed,
+                "hard_expert": c.experts[0], "easy_expert": c.experts[1], "reversed_replay": c.replay,
+                "hard_starts": c.starts[0], "easy_starts": c.starts[1],
+                "still_hard": c.still[0], "still_easy": c.still[1],
+                "random_hard": c.random[0], "random_easy": c.random[1],
+                "deepest_contact_mm": (c.deepest * 1e5).round() / 100.0,
+                "diverged": c.diverged, "through_table": c.through_table,
+                "steps_per_second": speed.round(), "image_size": SPEED.0,
+                "mean_rows_hard": c.rows[0] / n.max(1) as usize, "mean_rows_easy": c.rows[1] / n.max(1) as usize,
             });
             println!("{line}");
         } else {
-            println!("{name:<22} {n:>7} {hard:>12} {easy:>12} {replay:>16}");
+            let two = |[hard, easy]: [u32; 2]| format!("{hard}/{easy}");
+            println!(
+                "{name:<26} {:>9} {:>7} {:>8} {:>6} {:>7} {:>13.2} mm {speed:>8.0}",
+                two(c.experts),
+                c.replay,
+                two(c.starts),
+                two(c.still),
+                two(c.random),
+                c.deepest * 1e3,
+            );
+            if c.diverged + c.through_table > 0 {
+                println!("{:<26} {} diverged, {} fell through the table", "", c.diverged, c.through_table);
+            }
         }
     }
     Ok(())
 }
 
-fn measure(name: &str, arguments: &Arguments) -> Result<Count> {
+/// All counts of one variant, and its control steps a second on one thread.
+fn measure(name: &str, arguments: &Arguments) -> Result<(Count, f64)> {
     let (name, variant) = name.split_once(':').unwrap_or((name, ""));
     let mut options = TaskOptions { variant: variant.to_owned(), ..TaskOptions::default() };
     if arguments.clean {
         options.demonstrator = e2h_env::DemonstratorConfig::clean();
     }
     let task = task(name, &options)?;
+    let speed = speed(&task)?;
     let first = Env::new(task.clone(), &EnvConfig::physics(&*task))?;
     let workers = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     // Trials are split by worker, but what one does depends on its index alone.
     let parts: Vec<Result<Count>> = std::thread::scope(|scope| {
         let spawned: Vec<_> = (0..workers)
             .map(|worker| {
-                let (task, env) = (&task, first.clone_shared());
+                let env = first.clone_shared();
                 let trials = (worker..arguments.trials).step_by(workers as usize);
-                scope.spawn(move || run(task, &mut env?, trials, arguments.seed))
+                scope.spawn(move || run(&mut env?, trials, arguments.seed))
             })
             .collect();
         spawned
@@ -101,30 +151,71 @@ fn measure(name: &str, arguments: &Arguments) -> Result<Count> {
     });
     let mut total = Count::default();
     for part in parts {
-        let part = part?;
-        total.hard += part.hard;
-        total.easy += part.easy;
-        total.replay += part.replay;
-        total.rows = [total.rows[0] + part.rows[0], total.rows[1] + part.rows[1]];
+        total.add(&part?);
     }
-    Ok(total)
+    Ok((total, speed))
 }
 
-fn run(task: &Arc<dyn Task>, env: &mut Env, trials: impl Iterator<Item = u32>, seed: u64) -> Result<Count> {
+fn run(env: &mut Env, trials: impl Iterator<Item = u32>, seed: u64) -> Result<Count> {
+    let task = env.task().clone();
+    let config = ReverseConfig { reference_quaternion: task.eef_reference(), ..ReverseConfig::default() };
     let mut count = Count::default();
     for trial in trials {
-        let hard = record(task, env, Direction::Hard, trial, seed)?;
-        count.hard += u32::from(hard.outcome.is_success());
-        let easy = record(task, env, Direction::Easy, trial, seed)?;
-        count.easy += u32::from(easy.outcome.is_success());
-        count.rows = [count.rows[0] + hard.len(), count.rows[1] + easy.len()];
-        // The scene is where the easy demonstration left it: play that backwards, open loop.
-        env.begin(Direction::Hard)?;
-        let config = ReverseConfig { reference_quaternion: task.eef_reference(), ..ReverseConfig::default() };
-        let outcome = replay(env, &reverse(&easy, &config).action)?;
-        count.replay += u32::from(outcome.is_some_and(|o| o.is_success()));
+        for (d, direction) in BOTH.into_iter().enumerate() {
+            let episode = record(&task, env, direction, trial, seed)?;
+            count.experts[d] += u32::from(episode.outcome.is_success());
+            count.rows[d] += episode.len();
+            if direction == Direction::Easy {
+                // The scene is where the demonstration left it: play that backwards, open loop.
+                env.begin(Direction::Hard)?;
+                let outcome = replay(env, &reverse(&episode, &config).action)?;
+                count.replay += u32::from(outcome.is_some_and(|o| o.is_success()));
+            }
+        }
+        for (d, direction) in BOTH.into_iter().enumerate() {
+            let rng = |what: &str| stream(seed, &format!("{what}/{direction}"), 0, u64::from(trial));
+            env.reset(direction, &mut rng("start"))?;
+            let fresh = !env.success(direction);
+            env.home()?;
+            count.starts[d] += u32::from(fresh && env.success(direction.reverse()));
+            let hold = HOLDS[trial as usize % HOLDS.len()];
+            for policy in [Blind::Still, Blind::Random { hold }] {
+                let probed = probe(env, direction, policy, &mut rng("blind"))?;
+                let solved = u32::from(probed.outcome.is_success());
+                match policy {
+                    Blind::Still => count.still[d] += solved,
+                    Blind::Random { .. } => count.random[d] += solved,
+                }
+                count.diverged += u32::from(probed.outcome == Outcome::Diverged);
+                count.through_table += u32::from(probed.through_table);
+                count.deepest = count.deepest.max(probed.deepest);
+            }
+        }
     }
     Ok(count)
+}
+
+/// Control steps a second with both cameras, on this thread: a demonstration, over and over.
+fn speed(task: &Arc<dyn Task>) -> Result<f64> {
+    let config = EnvConfig { image_size: SPEED.0, ..EnvConfig::default() };
+    let mut env = Env::new(task.clone(), &config)?;
+    let actions = record(task, &mut env, Direction::Easy, 0, 0)?.action;
+    let (mut steps, start) = (0, Instant::now());
+    let mut resets = std::time::Duration::ZERO;
+    while steps < SPEED.1 {
+        let clock = Instant::now();
+        env.reset(Direction::Easy, &mut stream(0, Direction::Easy.name(), 0, 0))?;
+        resets += clock.elapsed();
+        for action in &actions {
+            let end = env.step(action)?;
+            env.observe()?;
+            steps += 1;
+            if end.is_some() {
+                break;
+            }
+        }
+    }
+    Ok(steps as f64 / (start.elapsed() - resets).as_secs_f64())
 }
 
 fn record(

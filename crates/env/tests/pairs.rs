@@ -3,12 +3,11 @@
 
 use e2h_core::{Action, Direction, Origin, Outcome, Pose, Rng, stream};
 use e2h_env::{
-    DemonstratorConfig, Env, EnvConfig, Error, Task, TaskOptions, demonstrate, registry, replay, task,
-    variants,
+    Blind, DemonstratorConfig, Env, EnvConfig, Error, Task, TaskOptions, demonstrate, probe, registry, replay,
+    task, variants,
 };
 use e2h_refine::{ReverseConfig, reverse};
 use nalgebra::Vector3;
-use rand::Rng as _;
 use std::sync::Arc;
 
 const BOTH: [Direction; 2] = [Direction::Hard, Direction::Easy];
@@ -205,34 +204,18 @@ fn reversed_easy_demonstrations_replay_in_the_hard_task() {
 }
 
 #[test]
-fn idle_and_random_policies_fail_and_break_nothing() {
+fn policies_that_do_not_look_fail_and_break_nothing() {
+    let policies = [Blind::Still, Blind::Random { hold: 1 }, Blind::Random { hold: 1 }, Blind::Random { hold: 20 }];
     each(|task, env| {
         for direction in BOTH {
-            for (moving, trial) in [(false, 0), (true, 0), (true, 1), (true, 2)] {
-                let mut rng = rng("idle", trial);
-                env.reset(direction, &mut rng).unwrap();
-                let name = format!("{} {direction}", label(task));
-                let outcome = loop {
-                    let mut action = stay(env);
-                    if moving {
-                        for (v, [low, high]) in action.iter_mut().zip([[0.3, 0.75], [-0.3, 0.3], [0.02, 0.4]])
-                        {
-                            *v = rng.random_range(low..high);
-                        }
-                        action[7] = f32::from(u8::from(rng.random_bool(0.5)));
-                    }
-                    if let Some(outcome) = env.step(&action).unwrap() {
-                        break outcome;
-                    }
-                    let p = env.sim().object().position;
-                    let over_table = (0.05..1.0).contains(&p.x) && p.y.abs() < 0.45;
-                    assert!(!over_table || p.z > 0.0, "{name}: the object went through the table");
-                    let depth = env.sim().penetration() * 1e3;
-                    assert!(depth < 1.0, "{name}: a contact is {depth:.2} mm deep");
-                };
+            for (trial, policy) in policies.into_iter().enumerate() {
+                let name = format!("{} {direction} {policy:?}", label(task));
+                let probed = probe(env, direction, policy, &mut rng("blind", trial as u64)).unwrap();
+                assert!(!probed.through_table, "{name}: the object went through the table");
+                assert!(probed.deepest < 1e-3, "{name}: a contact is {:.2} mm deep", probed.deepest * 1e3);
                 let ends = [Outcome::Timeout, Outcome::Dropped];
-                assert!(ends.contains(&outcome), "{name}: {outcome:?}");
-                assert!(moving || outcome == Outcome::Timeout, "{name}: {outcome:?} while holding still");
+                assert!(ends.contains(&probed.outcome), "{name}: {:?}", probed.outcome);
+                assert!(policy != Blind::Still || probed.outcome == Outcome::Timeout, "{name}: {:?}", probed.outcome);
             }
         }
     });

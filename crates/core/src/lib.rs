@@ -22,7 +22,7 @@ mod traits;
 pub use episode::{Action, Direction, Episode, Frames, Image, Kind, Observation, Origin, Outcome, State};
 pub use pose::{Pose, align_hemisphere};
 pub use random::{Rng, stream};
-pub use spelling::nearest;
+pub use spelling::{nearest, one_line};
 pub use traits::{ActionChunk, Policy, Value};
 
 /// Entries of a state row: eef position 3, eef quaternion 4, object position 3, object quaternion 4, gripper opening 1.

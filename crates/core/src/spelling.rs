@@ -23,3 +23,22 @@ fn edits(a: &str, b: &str) -> usize {
     }
     row[b.len()]
 }
+
+/// Longest text of a file that is repeated in a message, characters.
+const LONGEST: usize = 1000;
+
+/// Text out of a file, or about one, fit for a message: on one line, without control characters, and not too long.
+///
+/// ```
+/// assert_eq!(e2h_core::one_line("two\nlines"), "two\u{fffd}lines");
+/// ```
+#[must_use]
+pub fn one_line(text: &str) -> String {
+    let mut characters = text.chars();
+    let line: String =
+        characters.by_ref().take(LONGEST).map(|c| if c.is_control() { '\u{fffd}' } else { c }).collect();
+    match characters.count() {
+        0 => line,
+        more => format!("{line}... ({more} more characters)"),
+    }
+}

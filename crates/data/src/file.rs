@@ -1,7 +1,7 @@
 //! The bytes of one episode: a safetensors file that says what it is.
 
 use crate::{Error, Result};
-use e2h_core::{ACTION_DIM, Episode, Frames, Origin, Outcome, STATE_DIM};
+use e2h_core::{ACTION_DIM, Episode, Frames, Origin, Outcome, STATE_DIM, one_line};
 use safetensors::tensor::{Dtype, Metadata, SafeTensorError, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -70,7 +70,9 @@ pub(crate) fn header(bytes: &[u8], path: &Path) -> Result<Found> {
     let json =
         end.and_then(|end| bytes.get(8..end)).ok_or_else(|| broken(format!("{} bytes", bytes.len())))?;
     let metadata: Metadata = serde_json::from_slice(json).map_err(|e| broken(e.to_string()))?;
-    let length = 8 + json.len() + metadata.data_len();
+    let length = (8 + json.len())
+        .checked_add(metadata.data_len())
+        .ok_or_else(|| broken("columns beyond what a file can hold".to_owned()))?;
     let entry = metadata.metadata().as_ref().and_then(|m| m.get(KEY));
     let Some(entry) = entry else {
         return Err(file_error(path, "metadata", format!("key `{KEY}`"), "none: not an episode"));
@@ -158,8 +160,8 @@ pub(crate) fn file_error(
 ) -> Error {
     Error::File {
         path: path.to_owned(),
-        what: what.to_owned(),
-        expected: expected.into(),
-        found: found.into(),
+        what: one_line(what),
+        expected: one_line(&expected.into()),
+        found: one_line(&found.into()),
     }
 }

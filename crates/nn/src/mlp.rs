@@ -14,17 +14,20 @@ pub struct Mlp {
     dropout: f32,
 }
 
+/// Largest width that is taken for one.
+const WIDEST: usize = 1 << 30;
+
 impl Mlp {
     /// A network through the sizes `dims`, the input's first, that drops hidden numbers with probability `dropout`.
     ///
     /// # Errors
     /// [`Error::Config`] with fewer than two sizes, a size of zero, or a probability outside [0, 1).
     pub fn new(dims: &[usize], dropout: f32, builder: &Builder<'_>) -> Result<Self> {
-        if dims.len() < 2 {
+        if dims.len() < 2 || dims.iter().any(|d| *d > WIDEST) {
             let found = format!("{dims:?}");
             return Err(Error::Config {
                 what: "sizes of an mlp",
-                expected: "at least input and output",
+                expected: "at least input and output, none above 1073741824",
                 found,
             });
         }

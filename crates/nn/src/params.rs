@@ -3,11 +3,11 @@ use crate::kernel::conv::in_panels;
 use crate::numbers::Numbers;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
-use candle_core::{CpuStorage, InplaceOp1, Layout, Storage, Tensor, Var};
-use rand::Rng;
+use candle_core::{CpuStorage, DType, InplaceOp1, Layout, Storage, Tensor, Var};
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::cell::{Cell, RefCell};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// What a network is built for.
@@ -83,7 +83,15 @@ struct Shared {
     rng: RefCell<ChaCha8Rng>,
     params: RefCell<BTreeMap<String, Param>>,
     duplicate: Cell<Option<String>>,
+    /// Where only names and shapes are asked for: those, and what stands in for every weight.
+    plan: Option<(RefCell<Shapes>, Tensor)>,
 }
+
+/// Shapes by name.
+type Shapes = BTreeMap<String, Vec<usize>>;
+
+/// Parameters of a network whose shapes are asked for; the largest here has some hundred.
+const MOST: usize = 1 << 16;
 
 /// Collects the parameters of layers while they are built; a path, like `VarBuilder`.
 #[derive(Clone)]
@@ -109,6 +117,15 @@ impl Builder<'_> {
     /// Adds a parameter of PyTorch shape `shape`.
     pub(crate) fn weight(&self, name: &str, shape: &[usize], order: Order, init: Init) -> Result<Weight> {
         let name = self.pp(name).path;
+        if let Some((shapes, nothing)) = &self.shared.plan {
+            let mut shapes = shapes.borrow_mut();
+            if shapes.len() == MOST {
+                let found = format!("`{name}` after them");
+                return Err(Error::Config { what: "network", expected: "at most 65536 parameters", found });
+            }
+            shapes.insert(name, shape.to_vec());
+            return Ok(Weight { tensor: nothing.clone(), train: false, graph: false, bf16: false });
+        }
         let n = shape.iter().product();
         let data: Vec<f32> = match init {
             Init::Uniform(b) => {
@@ -183,6 +200,7 @@ impl Params {
             rng: RefCell::new(rng.clone()),
             params: RefCell::default(),
             duplicate: Cell::default(),
+            plan: None,
         };
         let built = f(&Builder { shared: &shared, path: String::new() })?;
         *rng = shared.rng.into_inner();
@@ -192,6 +210,27 @@ impl Params {
         let graph = compute.through_candle();
         let params = Arc::new(shared.params.into_inner());
         Ok((Self { params, compute: shared.compute, graph }, built))
+    }
+
+    /// Checks that the network which `f` builds has these weights, before there is memory for it: a file may describe a
+    /// network of any size.
+    ///
+    /// # Errors
+    /// What `f` returns, and [`Error::Import`] with every missing, unexpected and mis-shaped tensor.
+    pub fn check<T>(weights: &Weights, f: impl FnOnce(&Builder<'_>) -> Result<T>) -> Result<()> {
+        let compute = Compute::cpu();
+        let nothing = Tensor::zeros((), DType::F32, compute.device())?;
+        let shared = Shared {
+            mode: Mode::Infer,
+            compute,
+            rng: RefCell::new(ChaCha8Rng::seed_from_u64(0)),
+            params: RefCell::default(),
+            duplicate: Cell::default(),
+            plan: Some((RefCell::default(), nothing)),
+        };
+        f(&Builder { shared: &shared, path: String::new() })?;
+        let shapes = shared.plan.map(|(shapes, _)| shapes.into_inner()).unwrap_or_default();
+        fit(shapes.iter(), weights)
     }
 
     /// Where they are, and how they are computed with.
@@ -272,23 +311,7 @@ impl Params {
 
     /// Fails with the list of differences unless `weights` has these names and shapes.
     pub(crate) fn matches(&self, weights: &Weights) -> Result<()> {
-        let missing: Vec<String> =
-            self.params.keys().filter(|n| !weights.contains_key(*n)).cloned().collect();
-        let unexpected: Vec<String> =
-            weights.keys().filter(|n| !self.params.contains_key(*n)).cloned().collect();
-        let fits = |p: &Param, t: &HostTensor| p.shape == t.shape && t.data.len() == p.var.elem_count();
-        let misshaped: Vec<String> = self
-            .params
-            .iter()
-            .filter_map(|(n, p)| weights.get(n).filter(|t| !fits(p, t)).map(|t| (n, p, t)))
-            .map(|(n, p, t)| {
-                format!("{n}: expected {:?}, found {:?} with {} numbers", p.shape, t.shape, t.data.len())
-            })
-            .collect();
-        if missing.is_empty() && unexpected.is_empty() && misshaped.is_empty() {
-            return Ok(());
-        }
-        Err(Error::Import { missing, unexpected, misshaped })
+        fit(self.params.iter().map(|(n, p)| (n, &p.shape)), weights)
     }
 
     pub(crate) fn variables(&self) -> impl Iterator<Item = &Var> {
@@ -307,6 +330,30 @@ impl Params {
         let each = self.params.values().zip(weights.values());
         each.map(|(p, t)| Numbers::new(p.inward(&t.data), &p.var, self.graph)).collect()
     }
+}
+
+/// Fails with the list of differences unless `weights` has these names and shapes.
+fn fit<'a>(shapes: impl Iterator<Item = (&'a String, &'a Vec<usize>)>, weights: &Weights) -> Result<()> {
+    let (mut missing, mut misshaped) = (vec![], vec![]);
+    let mut unexpected: BTreeSet<&String> = weights.keys().collect();
+    for (name, shape) in shapes {
+        unexpected.remove(name);
+        let size = shape.iter().try_fold(1_usize, |n, size| n.checked_mul(*size));
+        match weights.get(name) {
+            None => missing.push(name.clone()),
+            Some(t) if t.shape != *shape || size != Some(t.data.len()) => misshaped.push(format!(
+                "{name}: expected {shape:?}, found {:?} with {} numbers",
+                t.shape,
+                t.data.len()
+            )),
+            Some(_) => {}
+        }
+    }
+    let unexpected: Vec<String> = unexpected.into_iter().cloned().collect();
+    if missing.is_empty() && unexpected.is_empty() && misshaped.is_empty() {
+        return Ok(());
+    }
+    Err(Error::Import { missing, unexpected, misshaped })
 }
 
 /// Copies between PyTorch's layout `shape` and that of the permuted axes, in the direction asked for.

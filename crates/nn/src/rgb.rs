@@ -4,6 +4,9 @@ use crate::tape::{Node, Tape, run};
 use crate::{Error, Result};
 use candle_core::Tensor;
 
+/// Largest width that is taken for one, and most stages: products of sizes stay far below what a number holds.
+const WIDEST: usize = 1 << 16;
+const STAGES: usize = 8;
 /// Channels of one group of the normalisations.
 const GROUP: usize = 16;
 
@@ -34,16 +37,16 @@ impl RgbEncoderConfig {
         if self.base_width == 0 || !self.base_width.is_multiple_of(GROUP) {
             return fail("base_width", "a positive multiple of 16", self.base_width.to_string());
         }
-        if self.stage_blocks.is_empty() || self.stage_blocks.contains(&0) {
-            return fail(
-                "stage_blocks",
-                "at least one stage of at least one block",
-                format!("{:?}", self.stage_blocks),
-            );
+        if self.base_width > WIDEST {
+            return fail("base_width", "at most 65536", self.base_width.to_string());
         }
-        if self.keypoints == 0 || self.feature_dim == 0 {
-            let found = format!("{} and {}", self.keypoints, self.feature_dim);
-            return fail("keypoints and feature_dim", "positive numbers", found);
+        let stages = &self.stage_blocks;
+        if !(1..=STAGES).contains(&stages.len()) || stages.contains(&0) {
+            return fail("stage_blocks", "1 to 8 stages of at least one block", format!("{stages:?}"));
+        }
+        let numbers = [self.keypoints, self.feature_dim];
+        if numbers.iter().any(|n| !(1..=WIDEST).contains(n)) {
+            return fail("keypoints and feature_dim", "1 to 65536", format!("{numbers:?}"));
         }
         if self.height == 0 || self.width == 0 {
             return fail(

@@ -24,26 +24,38 @@ pub struct UnetConfig {
     pub cond_dim: usize,
 }
 
+/// Largest width that is taken for one: products of sizes stay far below what a number holds.
+const WIDEST: usize = 1 << 20;
+/// Most levels.
+const DEEPEST: usize = 16;
+/// Largest condition.
+const CONDITION: usize = 1 << 30;
+
 impl UnetConfig {
     /// # Errors
     /// [`Error::Config`] names the first setting that does not work.
     pub fn validate(&self) -> Result<()> {
         let fail = |what, expected, found: String| Err(Error::Config { what, expected, found });
-        if self.input_dim == 0 {
-            return fail("input_dim", "at least 1", "0".into());
+        if self.input_dim == 0 || self.input_dim > WIDEST {
+            return fail("input_dim", "1 to 1048576", self.input_dim.to_string());
         }
-        if self.down_dims.is_empty() || self.down_dims.contains(&0) {
-            return fail("down_dims", "at least one positive size", format!("{:?}", self.down_dims));
+        let dims = &self.down_dims;
+        if dims.is_empty() || dims.len() > DEEPEST || dims.iter().any(|d| *d == 0 || *d > WIDEST) {
+            return fail("down_dims", "1 to 16 sizes of 1 to 1048576", format!("{dims:?}"));
         }
         if self.n_groups == 0 || self.down_dims.iter().any(|d| !d.is_multiple_of(self.n_groups)) {
             let found = format!("{} for {:?}", self.n_groups, self.down_dims);
             return fail("n_groups", "a divisor of every entry of down_dims", found);
         }
-        if self.kernel_size.is_multiple_of(2) {
-            return fail("kernel_size", "an odd number", self.kernel_size.to_string());
+        if self.kernel_size.is_multiple_of(2) || self.kernel_size > 1023 {
+            return fail("kernel_size", "an odd number up to 1023", self.kernel_size.to_string());
         }
-        if self.step_embed_dim < 4 || self.step_embed_dim % 2 == 1 {
-            return fail("step_embed_dim", "an even number from 4 on", self.step_embed_dim.to_string());
+        let embed = self.step_embed_dim;
+        if !(4..=WIDEST).contains(&embed) || embed % 2 == 1 {
+            return fail("step_embed_dim", "an even number, 4 to 1048576", embed.to_string());
+        }
+        if self.cond_dim > CONDITION {
+            return fail("cond_dim", "at most 1073741824", self.cond_dim.to_string());
         }
         Ok(())
     }

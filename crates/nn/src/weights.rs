@@ -64,6 +64,11 @@ pub fn save_weights(
     Ok(())
 }
 
+/// Text of a file for a message of one line.
+fn printable(text: &str) -> String {
+    text.replace(char::is_control, "\u{fffd}")
+}
+
 /// Reads a safetensors file of `f32` tensors, with its metadata.
 ///
 /// # Errors
@@ -79,7 +84,7 @@ pub fn load_weights(path: impl AsRef<Path>) -> Result<(Weights, BTreeMap<String,
     let not = |e: safetensors::SafeTensorError| Error::File {
         path: path.to_path_buf(),
         expected: "a safetensors file",
-        found: e.to_string(),
+        found: printable(&e.to_string()),
     };
     let (_, header) = SafeTensors::read_metadata(&bytes).map_err(not)?;
     let metadata = header.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
@@ -89,7 +94,7 @@ pub fn load_weights(path: impl AsRef<Path>) -> Result<(Weights, BTreeMap<String,
             return Err(Error::File {
                 path: path.to_path_buf(),
                 expected: "tensors of type F32",
-                found: format!("`{name}` of type {:?}", view.dtype()),
+                found: format!("`{}` of type {:?}", printable(&name), view.dtype()),
             });
         }
         let data =

@@ -122,7 +122,8 @@ impl Checkpoint {
                 file.state_dim, file.action_dim
             )));
         }
-        file.config.validate()?;
+        file.config.validate().map_err(|e| fail(e.to_string()))?;
+        let normaliser = file.normaliser.check().map_err(|e| fail(e.to_string()))?;
         let weights_path = dir.join(WEIGHTS_FILE);
         let bytes = std::fs::read(&weights_path).map_err(|source| Error::Io {
             doing: "reading checkpoint",
@@ -136,10 +137,10 @@ impl Checkpoint {
                 problem: format!("expected SHA-256 {}, found {found}", file.weights_sha256),
             });
         }
-        let (mut weights, _) = e2h_nn::load_weights(&weights_path)?;
+        let (mut weights, _) = read_weights(&weights_path)?;
         // In a folder that LeRobot opens too; computed here.
         weights.retain(|name, _| !name.ends_with(POSITION_GRID));
-        Ok((Self { config: file.config, normaliser: file.normaliser, provenance: file.provenance }, weights))
+        Ok((Self { config: file.config, normaliser, provenance: file.provenance }, weights))
     }
 }
 
@@ -150,6 +151,19 @@ pub(crate) fn write_beside(dir: &Path, name: &str, value: &impl Serialize) -> Re
         .map_err(|e| Error::Checkpoint { path: path.clone(), problem: e.to_string() })?;
     text.push('\n');
     Ok(e2h_data::write_atomic(&path, text.as_bytes())?)
+}
+
+/// Reads weights to act with, which are numbers.
+pub(crate) fn read_weights(path: &Path) -> Result<(Weights, BTreeMap<String, String>)> {
+    let (weights, metadata) = e2h_nn::load_weights(path)?;
+    for (name, tensor) in &weights {
+        if let Some(entry) = tensor.data.iter().position(|v| !v.is_finite()) {
+            let problem =
+                format!("`{name}`, entry {entry}: expected a finite number, found {}", tensor.data[entry]);
+            return Err(Error::Checkpoint { path: path.to_owned(), problem });
+        }
+    }
+    Ok((weights, metadata))
 }
 
 pub(crate) fn hex(bytes: &[u8]) -> String {

@@ -120,6 +120,9 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
+/// Levels of a U-Net; each halves the horizon.
+const MOST_LEVELS: usize = 16;
+
 impl PolicyConfig {
     /// A network for tests and examples: seconds to train, too small to learn much.
     #[must_use]
@@ -182,8 +185,21 @@ impl PolicyConfig {
                 problems.push(text);
             }
         };
-        let positive = |v: usize| v > 0;
-        check(positive(self.n_obs_steps), "n_obs_steps: expected at least 1, got 0".to_owned());
+        // A file may say anything; what is above these has no memory anywhere, and its products no number.
+        for (name, value, least, most) in [
+            ("n_obs_steps", self.n_obs_steps, 1, 1 << 10),
+            ("horizon", self.horizon, 1, 1 << 16),
+            ("train_timesteps", self.train_timesteps, 1, 1 << 20),
+            ("image_size", self.image_size, 0, 1 << 16),
+            ("cameras", self.cameras.len(), 0, 1 << 6),
+            ("image_features", self.image_features, 0, 1 << 16),
+            ("levels of down_dims", self.down_dims.len(), 1, MOST_LEVELS),
+        ] {
+            check(
+                (least..=most).contains(&value),
+                format!("{name}: expected {least} to {most}, got {value}"),
+            );
+        }
         check(
             self.n_image_steps <= self.n_obs_steps,
             format!(
@@ -191,10 +207,9 @@ impl PolicyConfig {
                 self.n_obs_steps, self.n_image_steps
             ),
         );
-        let multiple = 1 << self.down_dims.len().saturating_sub(1);
-        check(!self.down_dims.is_empty(), "down_dims: expected at least one level, got none".to_owned());
+        let multiple = 1 << self.down_dims.len().clamp(1, MOST_LEVELS).saturating_sub(1);
         check(
-            self.horizon > 0 && self.horizon.is_multiple_of(multiple),
+            self.horizon.is_multiple_of(multiple),
             format!(
                 "horizon: expected a multiple of {multiple} for {} levels, got {}",
                 self.down_dims.len(),
@@ -203,7 +218,7 @@ impl PolicyConfig {
         );
         let offset = if self.lerobot_alignment { self.n_obs_steps.saturating_sub(1) } else { 0 };
         check(
-            self.n_action_steps > 0 && self.n_action_steps + offset <= self.horizon,
+            self.n_action_steps > 0 && self.n_action_steps <= self.horizon.saturating_sub(offset),
             format!(
                 "n_action_steps: expected 1 to {} in this alignment, got {}",
                 self.horizon.saturating_sub(offset),
@@ -228,6 +243,7 @@ impl PolicyConfig {
             self.inference_steps > 0 && self.inference_steps <= self.train_timesteps,
             format!("inference_steps: expected 1 to {}, got {}", self.train_timesteps, self.inference_steps),
         );
+        check(self.guidance.is_finite(), format!("guidance: expected a number, got {}", self.guidance));
         check(
             self.state_limit >= 0.0 && self.state_limit.is_finite(),
             format!("state_limit: expected 0 or more, got {}", self.state_limit),

@@ -7,7 +7,7 @@ use crate::{CriticConfig, Error, PolicyConfig, Result};
 use candle_core::Tensor;
 use e2h_core::{Episode, Rng, Value, stream};
 use e2h_data::Normaliser;
-use e2h_nn::{Adam, Compute, Mlp, Mode, Params, Weights, backward};
+use e2h_nn::{Adam, Builder, Compute, Mlp, Mode, Params, Weights, backward};
 use rand::Rng as _;
 use rand::seq::SliceRandom as _;
 
@@ -41,18 +41,40 @@ impl Critic {
         mode: Mode,
         seed: u64,
     ) -> Result<Self> {
-        let config = PolicyConfig { crop_size: critic.crop_size.min(policy.crop_size), ..policy.clone() };
+        let config = Self::config(policy, critic);
+        let (params, (condition, head)) =
+            Params::build_on(compute, mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
+                Self::parts(&config, critic, b)
+            })?;
+        Ok(Self { params, condition, head, normaliser: normaliser.clone(), config })
+    }
+
+    /// A critic with given weights, on the CPU.
+    pub(crate) fn with_weights(
+        policy: &PolicyConfig,
+        critic: &CriticConfig,
+        normaliser: &Normaliser,
+        weights: &Weights,
+    ) -> Result<Self> {
+        Params::check(weights, |b| Self::parts(&Self::config(policy, critic), critic, b))?;
+        let this = Self::new(policy, critic, &Compute::cpu(), normaliser, Mode::Infer, 0)?;
+        this.params.import(weights)?;
+        Ok(this)
+    }
+
+    fn config(policy: &PolicyConfig, critic: &CriticConfig) -> PolicyConfig {
+        PolicyConfig { crop_size: critic.crop_size.min(policy.crop_size), ..policy.clone() }
+    }
+
+    fn parts(
+        config: &PolicyConfig,
+        critic: &CriticConfig,
+        b: &Builder<'_>,
+    ) -> e2h_nn::Result<(ConditionEncoder, Mlp)> {
         let dims: Vec<usize> =
             std::iter::once(config.condition_dim()).chain(critic.hidden.iter().copied()).chain([1]).collect();
-        let mut condition = None;
-        let (params, head) =
-            Params::build_on(compute, mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
-                condition = Some(ConditionEncoder::new(&config, config.state_features(), &b.pp("diffusion")));
-                Mlp::new(&dims, critic.dropout, &b.pp("head"))
-            })?;
-        let condition =
-            condition.unwrap_or_else(|| Err(Error::Config("the critic has no encoder".to_owned())))?;
-        Ok(Self { params, condition, head, normaliser: normaliser.clone(), config })
+        let condition = ConditionEncoder::new(config, config.state_features(), &b.pp("diffusion"))?;
+        Ok((condition, Mlp::new(&dims, critic.dropout, &b.pp("head"))?))
     }
 
     /// Starts the image encoders from a policy's; the head stays as drawn.

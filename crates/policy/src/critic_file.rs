@@ -1,10 +1,9 @@
 //! A critic on disk: `critic.json` and `model.safetensors` in one folder, which stand alone.
 
-use crate::checkpoint::{hex, write_beside};
+use crate::checkpoint::{hex, read_weights, write_beside};
 use crate::{Critic, CriticConfig, Error, PolicyConfig, Result};
 use e2h_core::STATE_DIM;
 use e2h_data::Normaliser;
-use e2h_nn::{Compute, Mode};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -124,20 +123,17 @@ impl Critic {
             }
         }
         let file: File = serde_json::from_value(value).map_err(|e| fail(e.to_string()))?;
-        file.network.validate()?;
-        let normaliser = file.normaliser.check()?;
+        file.network.validate().map_err(|e| fail(e.to_string()))?;
+        let normaliser = file.normaliser.check().map_err(|e| fail(e.to_string()))?;
         let weights_path = dir.join(WEIGHTS_FILE);
         let found = hex(&read(&weights_path)?);
         if found != file.weights_sha256 {
             let problem = format!("expected SHA-256 {}, found {found}", file.weights_sha256);
             return Err(Error::Checkpoint { path: weights_path, problem });
         }
-        let critic = Self::new(&file.network, &file.critic, &Compute::cpu(), &normaliser, Mode::Infer, 0)?;
-        let (weights, _) = e2h_nn::load_weights(&weights_path)?;
-        critic
-            .params
-            .import(&weights)
-            .map_err(|e| Error::Checkpoint { path: weights_path, problem: e.to_string() })?;
+        let (weights, _) = read_weights(&weights_path)?;
+        let critic = Self::with_weights(&file.network, &file.critic, &normaliser, &weights)
+            .map_err(|e| Error::Checkpoint { path: dir.to_owned(), problem: e.to_string() })?;
         Ok((critic, file.provenance))
     }
 }

@@ -1,4 +1,5 @@
 use crate::lerobot::Obstacle;
+use e2h_core::one_line;
 use std::path::PathBuf;
 
 /// What can go wrong with a policy, its training or its checkpoint.
@@ -6,7 +7,7 @@ use std::path::PathBuf;
 #[non_exhaustive]
 pub enum Error {
     /// A configuration that cannot work; one line a problem.
-    #[error("policy configuration: {0}")]
+    #[error("policy configuration: {}", printable(.0))]
     Config(String),
     /// Observations that do not fit the policy.
     #[error("observation: {quantity}: expected {expected}, got {found}")]
@@ -34,7 +35,7 @@ pub enum Error {
         loss: f32,
     },
     /// A checkpoint that does not match what is asked of it; lists all that differs.
-    #[error("checkpoint {path}: {problem}")]
+    #[error("checkpoint {path}: {}", printable(.problem))]
     Checkpoint {
         /// Folder or file.
         path: PathBuf,
@@ -73,7 +74,12 @@ pub enum Error {
 }
 
 fn list(obstacles: &[Obstacle]) -> String {
-    obstacles.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ")
+    obstacles.iter().map(|o| one_line(&o.to_string())).collect::<Vec<_>>().join("; ")
+}
+
+/// Text of a file for a message of one line; lists of tensors stay whole.
+fn printable(text: &str) -> String {
+    text.replace(char::is_control, "\u{fffd}")
 }
 
 impl From<Error> for e2h_core::Error {

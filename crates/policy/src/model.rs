@@ -3,7 +3,9 @@
 use crate::{PolicyConfig, Result};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Rng};
-use e2h_nn::{Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig};
+use e2h_nn::{
+    Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig, Weights,
+};
 
 /// Turns images and states into one vector an observation history.
 pub(crate) struct ConditionEncoder {
@@ -14,7 +16,7 @@ pub(crate) struct ConditionEncoder {
 }
 
 impl ConditionEncoder {
-    pub(crate) fn new(config: &PolicyConfig, state: usize, builder: &Builder) -> Result<Self> {
+    pub(crate) fn new(config: &PolicyConfig, state: usize, builder: &Builder) -> e2h_nn::Result<Self> {
         let encoder = RgbEncoderConfig {
             height: config.crop_size,
             width: config.crop_size,
@@ -111,6 +113,29 @@ impl DiffusionModel {
         rng: &mut Rng,
     ) -> Result<Self> {
         config.validate()?;
+        let (params, (condition, unet)) =
+            Params::build_on(compute, mode, rng, |b| Self::parts(config, widths, b))?;
+        Ok(Self { params, condition, unet })
+    }
+
+    /// A network with given weights, on the CPU. Memory is taken only for a network that these weights are of.
+    ///
+    /// # Errors
+    /// When the configuration does not fit together; otherwise lists every tensor that differs.
+    pub(crate) fn with_weights(config: &PolicyConfig, widths: Widths, weights: &Weights) -> Result<Self> {
+        config.validate()?;
+        Params::check(weights, |b| Self::parts(config, widths, b))?;
+        let mut rng = e2h_core::stream(0, "weights", 0, 0);
+        let this = Self::of_widths(&Compute::cpu(), config, widths, Mode::Infer, &mut rng)?;
+        this.params.import(weights)?;
+        Ok(this)
+    }
+
+    fn parts(
+        config: &PolicyConfig,
+        widths: Widths,
+        b: &Builder<'_>,
+    ) -> e2h_nn::Result<(ConditionEncoder, ConditionalUnet1d)> {
         let unet = UnetConfig {
             input_dim: widths.action,
             down_dims: config.down_dims.clone(),
@@ -119,15 +144,9 @@ impl DiffusionModel {
             step_embed_dim: config.step_embed_dim,
             cond_dim: config.condition_width(widths.state),
         };
-        let mut condition = None;
-        let (params, unet) = Params::build_on(compute, mode, rng, |b| {
-            let b = b.pp("diffusion");
-            condition = Some(ConditionEncoder::new(config, widths.state, &b));
-            ConditionalUnet1d::new(&unet, &b.pp("unet"))
-        })?;
-        let condition = condition
-            .unwrap_or_else(|| Err(crate::Error::Config("the network has no encoder".to_owned())))?;
-        Ok(Self { params, condition, unet })
+        let b = b.pp("diffusion");
+        let condition = ConditionEncoder::new(config, widths.state, &b)?;
+        Ok((condition, ConditionalUnet1d::new(&unet, &b.pp("unet"))?))
     }
 
     /// Names, shapes and values of the parameters.

@@ -1,6 +1,7 @@
 //! A trained policy: observations in, action chunks out.
 
 use crate::batch::{Host, Rows};
+use crate::model::Widths;
 use crate::{Checkpoint, Ddim, DiffusionModel, Error, PolicyConfig, Provenance, Result, SamplerKind};
 use candle_core::Tensor;
 use e2h_core::{ACTION_DIM, Action, ActionChunk, Observation, Policy, Rng, stream};
@@ -33,9 +34,10 @@ impl DiffusionPolicy {
     /// # Errors
     /// When the weights are not those of this configuration; lists every tensor that differs.
     pub fn with_weights(config: &PolicyConfig, normaliser: &Normaliser, weights: &Weights) -> Result<Self> {
-        let policy = Self::untrained(config, normaliser, 0)?;
-        policy.model.params.import(weights)?;
-        Ok(policy)
+        let widths = Widths { state: config.state_features(), action: ACTION_DIM };
+        let model = DiffusionModel::with_weights(config, widths, weights)?;
+        let ddim = Ddim::new(config.train_timesteps, config.inference_steps, config.prediction)?;
+        Ok(Self { model, ddim, normaliser: normaliser.clone(), config: config.clone() })
     }
 
     /// The same policy on another device.

@@ -5,7 +5,7 @@
 use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_policy::{
-    CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind,
+    Checkpoint, CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind,
     TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::sync::Arc;
@@ -90,6 +90,51 @@ fn a_checkpoint_comes_back_and_refuses_another_network() {
     let short = Observation { state: [0.0; 15], frames: vec![] };
     let error = policy.sample(&[vec![&short, &short]], &mut [stream(0, "act", 0, 0)]).err().unwrap();
     assert!(matches!(error, Error::Observation { .. }), "{error}");
+}
+
+/// What `policy.json` describes is refused by what the weights are, before there is memory for it, and numbers that are none
+/// are refused too; always by the file's name.
+#[test]
+fn a_checkpoint_of_impossible_numbers_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let ranges = Normaliser {
+        state_min: [-1.0; 15],
+        state_max: [1.0; 15],
+        action_min: [-1.0; 8],
+        action_max: [1.0; 8],
+    };
+    let config = PolicyConfig { cameras: vec![], ..PolicyConfig::tiny() };
+    let policy = DiffusionPolicy::untrained(&config, &ranges, 1).unwrap();
+    policy.save(folder.path(), &Provenance::default()).unwrap();
+    let path = folder.path().join("policy.json");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let refusal = |from: &str, to: &str| {
+        let compact: serde_json::Value = serde_json::from_str(&text).unwrap();
+        let compact = compact.to_string();
+        assert!(compact.contains(from), "{from} in {compact}");
+        std::fs::write(&path, compact.replacen(from, to, 1)).unwrap();
+        let message = DiffusionPolicy::load(folder.path()).err().unwrap().to_string();
+        assert!(message.contains(folder.path().to_str().unwrap()), "{message}");
+        message
+    };
+    let dims = "\"down_dims\":[16,16]";
+    assert!(refusal(dims, "\"down_dims\":[1048576,1048576]").contains("of another shape"));
+    assert!(refusal(dims, "\"down_dims\":[72057594037927936]").contains("1 to 16 sizes"));
+    assert!(refusal("\"horizon\":16", "\"horizon\":1152921504606846976").contains("horizon"));
+    assert!(refusal("\"guidance\":1.0", "\"guidance\":1e39").contains("guidance: expected a number"));
+    let range = "\"state_max\":[1.0,";
+    assert!(refusal(range, "\"state_max\":[-1.0,").contains("state entry 0: expected finite ends"));
+    assert!(refusal(range, "\"state_max\":[1e39,").contains("state entry 0"));
+
+    // A weight that is none, under a checksum that fits.
+    let mut weights = policy.weights().unwrap();
+    weights.get_mut("diffusion.unet.final_conv.1.bias").unwrap().data[3] = f32::NAN;
+    Checkpoint { config, normaliser: ranges, provenance: Provenance::default() }
+        .write(folder.path(), &weights)
+        .unwrap();
+    let message = DiffusionPolicy::load(folder.path()).err().unwrap().to_string();
+    let expected = "`diffusion.unet.final_conv.1.bias`, entry 3: expected a finite number, found NaN";
+    assert!(message.ends_with(expected) && message.contains("model.safetensors"), "{message}");
 }
 
 #[test]

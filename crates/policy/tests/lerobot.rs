@@ -70,6 +70,41 @@ fn a_low_dimensional_policy_of_lerobots_acts_the_same_with_its_own_sampler() {
     assert_ne!(act(1), act(2));
 }
 
+/// `config.json` may describe a network of any size, and so may a checkpoint of ours: it is refused by what the weights are,
+/// before there is memory for it.
+#[test]
+fn a_network_that_no_memory_holds_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    for file in std::fs::read_dir(golden("state")).unwrap() {
+        let file = file.unwrap();
+        std::fs::copy(file.path(), folder.path().join(file.file_name())).unwrap();
+    }
+    let path = folder.path().join("config.json");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let refusal = |change: &dyn Fn(&mut Value)| {
+        let mut value: Value = serde_json::from_str(&text).unwrap();
+        change(&mut value);
+        std::fs::write(&path, value.to_string()).unwrap();
+        let message = import(folder.path()).err().unwrap().to_string();
+        let named = message.contains(folder.path().to_str().unwrap());
+        assert!(named && !message.contains(char::is_control), "{message}");
+        message
+    };
+    let dims = |dims: &[usize]| refusal(&|v: &mut Value| v["down_dims"] = dims.into());
+    assert!(dims(&[1 << 20, 1 << 20]).contains("of another shape"));
+    assert!(dims(&[1 << 40]).contains("1 to 16 sizes of 1 to 1048576"));
+    assert!(dims(&[8; 70]).contains("levels of down_dims: expected 1 to 16, got 70"));
+    assert!(refusal(&|v| v["horizon"] = (1_u64 << 60).into()).contains("horizon: expected 1 to 65536"));
+    assert!(refusal(&|v| v["num_train_timesteps"] = (1_u64 << 50).into()).contains("train_timesteps"));
+    assert!(refusal(&|v| v["n_obs_steps"] = u64::MAX.into()).contains("n_obs_steps"));
+    assert!(refusal(&|v| v["spatial_softmax_num_keypoints"] = u64::MAX.into()).contains("image_features"));
+    let wide =
+        |key: &str| refusal(&|v: &mut Value| v["input_features"][key]["shape"] = vec![1_u64 << 62].into());
+    assert!(wide("observation.state").contains("a vector of up to 65536 numbers"));
+    assert!(wide("observation.environment_state").contains("a vector of up to 65536 numbers"));
+    refusal(&|v| v["type"] = "dif\nfusion".into());
+}
+
 #[test]
 fn an_image_policy_of_lerobots_acts_the_same() {
     let folder = tempfile::tempdir().unwrap();

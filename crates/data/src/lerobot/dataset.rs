@@ -172,12 +172,12 @@ impl Dataset {
     /// As [`Dataset::read_columns`].
     pub fn row_tasks(&self, episode: usize) -> Result<Vec<&str>> {
         let table = self.read_columns(episode, &["task_index"])?;
+        let path = self.data_path(self.span(episode)?.file)?;
         let task = |(row, &i): (usize, &i64)| {
             let found = usize::try_from(i).ok().and_then(|i| self.tasks.get(i));
-            found.map(String::as_str).ok_or_else(|| Error::Column {
-                column: format!("task_index, episode {episode}, row {row}"),
-                expected: format!("below {}", self.tasks.len()),
-                found: i.to_string(),
+            found.map(String::as_str).ok_or_else(|| {
+                let what = format!("column `task_index`, row {row} of episode {episode}");
+                file_error(&path, &what, format!("below {}", self.tasks.len()), i.to_string())
             })
         };
         table.i64("task_index")?.iter().enumerate().map(task).collect()

@@ -3,6 +3,7 @@
 use super::feature::{Dtype, Feature, Features};
 use super::table::{Column, Table, column_error};
 use super::{Dataset, Writer, picture};
+use crate::file::file_error;
 use crate::{Error, Result};
 use e2h_core::{ACTION_DIM, Direction, Episode, Frames, Kind, Origin, Outcome, STATE_DIM};
 use std::path::Path;
@@ -271,6 +272,20 @@ impl Dataset {
     pub fn read_episode(&self, index: usize) -> Result<Episode> {
         let table = self.read(index)?;
         let task = self.episodes()[index].tasks.first().map_or("", String::as_str);
-        Ok(from_table(&table, &self.info().features, task)?.0)
+        let path = self.data_path(self.episodes()[index].file)?;
+        let named = |e| match e {
+            Error::Column { column, expected, found } => {
+                file_error(&path, &format!("episode {index}, column `{column}`"), expected, found)
+            }
+            Error::File { what, expected, found, .. } => {
+                file_error(&path, &format!("episode {index}, {what}"), expected, found)
+            }
+            Error::Episode { source, .. } => {
+                let what = format!("episode {index}");
+                file_error(&path, &what, "an episode of this project", source.to_string())
+            }
+            other => other,
+        };
+        Ok(from_table(&table, &self.info().features, task).map_err(named)?.0)
     }
 }

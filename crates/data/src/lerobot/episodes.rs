@@ -80,26 +80,30 @@ pub(crate) fn read_file(path: &Path, info: &Info, out: &mut Vec<EpisodeSpan>) ->
         "meta/episodes/chunk_index",
         "meta/episodes/file_index",
     ];
-    let read = |name: &str| -> Result<Vec<usize>> {
-        let mut columns = file.read(&[(name, &integer)], 0..rows)?;
-        let Some((_, Column::I64(values))) = columns.pop() else { return Ok(vec![]) };
-        let unsigned = |(row, v): (usize, i64)| {
-            usize::try_from(v).map_err(|_| {
-                let what = format!("column `{name}`, row {row}");
-                file_error(path, &what, "a count", v.to_string())
-            })
-        };
-        values.into_iter().enumerate().map(unsigned).collect()
+    let read = |names: &[&str]| -> Result<std::vec::IntoIter<Vec<usize>>> {
+        let features: Vec<(&str, &Feature)> = names.iter().map(|n| (*n, &integer)).collect();
+        let counts = file.read(&features, 0..rows)?.into_iter().map(|(name, column)| {
+            let Column::I64(values) = column else { return Ok(vec![]) };
+            let unsigned = |(row, v): (usize, i64)| {
+                usize::try_from(v).map_err(|_| {
+                    let what = format!("column `{name}`, row {row}");
+                    file_error(path, &what, "a count", v.to_string())
+                })
+            };
+            values.into_iter().enumerate().map(unsigned).collect()
+        });
+        Ok(counts.collect::<Result<Vec<_>>>()?.into_iter())
     };
     let [index, length, from, to, chunk, data_file, listed_chunk, listed_file] = {
-        let mut found = integers.iter().map(|n| read(n)).collect::<Result<Vec<_>>>()?.into_iter();
+        let mut found = read(&integers)?;
         std::array::from_fn(|_| found.next().unwrap_or_default())
     };
     let tasks = read_tasks(&file, rows)?;
     let mut videos: Vec<BTreeMap<String, VideoSpan>> = vec![BTreeMap::new(); rows];
     for (key, _) in info.features.iter().filter(|(_, f)| f.dtype == Dtype::Video) {
-        let (c, f) =
-            (read(&format!("videos/{key}/chunk_index"))?, read(&format!("videos/{key}/file_index"))?);
+        let names = ["chunk_index", "file_index"].map(|n| format!("videos/{key}/{n}"));
+        let mut found = read(&names.each_ref().map(String::as_str))?;
+        let (c, f) = (found.next().unwrap_or_default(), found.next().unwrap_or_default());
         let (start, end) = (format!("videos/{key}/from_timestamp"), format!("videos/{key}/to_timestamp"));
         let times = file.read(&[(&start, &float), (&end, &float)], 0..rows)?;
         let [(_, Column::F64(start)), (_, Column::F64(end))] = &times[..] else { continue };
@@ -224,13 +228,15 @@ fn stat_columns(name: &str, kind: Bounds, stats: &[&FeatureStats]) -> Vec<(Strin
 /// The statistics of the first `rows` entries of a file.
 pub(crate) fn read_stats(path: &Path, features: &Features, rows: usize) -> Result<Vec<Stats>> {
     let file = ParquetFile::open(path)?;
+    let features = features.iter().filter(|(_, f)| f.dtype != Dtype::String);
+    let keys = || ["min", "max", "mean", "std"].into_iter().chain(QUANTILES.map(|q| q.0)).chain(["count"]);
+    let names: Vec<String> =
+        features.clone().flat_map(|(name, _)| keys().map(move |key| format!("stats/{name}/{key}"))).collect();
+    // All columns at once: each pass over a file looks at all of them, whichever it reads.
+    let mut lists = numbers(&file, &names, rows)?.into_iter();
     let mut out: Vec<Stats> = vec![vec![]; rows];
-    for (name, feature) in features.iter().filter(|(_, f)| f.dtype != Dtype::String) {
-        let mut lists: Vec<Vec<Vec<f64>>> = vec![];
-        let keys = ["min", "max", "mean", "std"].into_iter().chain(QUANTILES.map(|q| q.0)).chain(["count"]);
-        for key in keys {
-            lists.push(numbers(&file, &format!("stats/{name}/{key}"), rows)?);
-        }
+    for (name, feature) in features {
+        let mut lists: Vec<Vec<Vec<f64>>> = lists.by_ref().take(keys().count()).collect();
         let width = if feature.is_visual() { 3 } else { feature.shape.last().copied().unwrap_or(1) };
         for (row, stats) in out.iter_mut().enumerate() {
             let mut found: Vec<Vec<f64>> =
@@ -259,34 +265,41 @@ pub(crate) fn read_stats(path: &Path, features: &Features, rows: usize) -> Resul
     Ok(out)
 }
 
-/// Every row's numbers, however deep its lists are.
-fn numbers(file: &ParquetFile, column: &str, rows: usize) -> Result<Vec<Vec<f64>>> {
-    let mut out = vec![];
-    file.batches(&[column], 0..rows, &mut |batch, first| {
-        let array = batch.column(0);
-        for row in 0..array.len() {
-            let mut value = array.slice(row, 1);
-            while let DataType::List(_) = value.data_type() {
-                let list = value.as_list::<i32>();
-                let (start, end) = (list.value_offsets()[0], list.value_offsets()[list.len()]);
-                value = list.values().slice(start as usize, (end - start) as usize);
+/// Every row's numbers of some columns, however deep its lists are.
+///
+/// # Shapes
+/// (columns, rows, numbers)
+fn numbers(file: &ParquetFile, columns: &[String], rows: usize) -> Result<Vec<Vec<Vec<f64>>>> {
+    let names: Vec<&str> = columns.iter().map(String::as_str).collect();
+    let mut out = vec![vec![]; columns.len()];
+    file.batches(&names, 0..rows, &mut |batch, first| {
+        for (column, out) in columns.iter().zip(&mut out) {
+            let bad = |row: usize, found: String| {
+                file_error(&file.path, &format!("column `{column}`, row {row}"), "numbers", found)
+            };
+            let array =
+                batch.column_by_name(column).ok_or_else(|| bad(first, "no such column".to_owned()))?;
+            for row in 0..array.len() {
+                let mut value = array.slice(row, 1);
+                while let DataType::List(_) = value.data_type() {
+                    let list = value.as_list::<i32>();
+                    let (start, end) = (list.value_offsets()[0], list.value_offsets()[list.len()]);
+                    value = list.values().slice(start as usize, (end - start) as usize);
+                }
+                out.push(match value.data_type() {
+                    DataType::Float64 => {
+                        value.as_primitive::<arrow_array::types::Float64Type>().values().to_vec()
+                    }
+                    DataType::Int64 => {
+                        let values = value.as_primitive::<arrow_array::types::Int64Type>().values();
+                        values.iter().map(|&v| v as f64).collect()
+                    }
+                    DataType::Boolean => {
+                        value.as_boolean().values().iter().map(|v| f64::from(u8::from(v))).collect()
+                    }
+                    other => return Err(bad(first + row, other.to_string())),
+                });
             }
-            out.push(match value.data_type() {
-                DataType::Float64 => {
-                    value.as_primitive::<arrow_array::types::Float64Type>().values().to_vec()
-                }
-                DataType::Int64 => {
-                    let values = value.as_primitive::<arrow_array::types::Int64Type>().values();
-                    values.iter().map(|&v| v as f64).collect()
-                }
-                DataType::Boolean => {
-                    value.as_boolean().values().iter().map(|v| f64::from(u8::from(v))).collect()
-                }
-                other => {
-                    let what = format!("column `{column}`, row {}", first + row);
-                    return Err(file_error(&file.path, &what, "numbers", other.to_string()));
-                }
-            });
         }
         Ok(())
     })?;

@@ -303,8 +303,9 @@ impl Info {
         }
         for (i, (name, feature)) in self.features.iter().enumerate() {
             let what = format!("feature `{name}`");
-            if name.is_empty() || name.contains(['/', '\\', '\0']) || name == ".." || name == "." {
-                return bad(&what, "a name without `/`", format!("{name:?}"));
+            let control = name.contains(char::is_control);
+            if name.is_empty() || control || name.contains(['/', '\\']) || name == ".." || name == "." {
+                return bad(&what, "a name without `/` and control characters", format!("{name:?}"));
             }
             if self.features[..i].iter().any(|(n, _)| n == name) {
                 return bad(&what, "each name once", "it twice".to_owned());
@@ -369,7 +370,8 @@ fn expand(
     };
     let path = PathBuf::from(&filled);
     let inside = path.components().all(|c| matches!(c, Component::Normal(_)));
-    if inside && numbers && !filled.contains(['{', '}', '\\']) { Ok(path) } else { Err(template.to_owned()) }
+    let plain = !filled.contains(['{', '}', '\\']) && !filled.contains(char::is_control);
+    if inside && numbers && plain { Ok(path) } else { Err(template.to_owned()) }
 }
 
 #[cfg(test)]

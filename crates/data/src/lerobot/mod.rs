@@ -16,6 +16,7 @@ mod episodes;
 mod feature;
 mod parquet_file;
 mod picture;
+mod promises;
 mod robot;
 mod stats;
 mod table;

@@ -1,6 +1,7 @@
 //! Parquet files: columns from and to Arrow, checksums, and errors that say where.
 
 use super::feature::{Dtype, Feature};
+use super::promises::{self, Page};
 use super::table::Column;
 use crate::atomic::{io, persist, unfinished};
 use crate::file::file_error;
@@ -15,16 +16,19 @@ use arrow_array::{
 };
 use arrow_buffer::OffsetBuffer;
 use arrow_schema::{DataType, Field, Fields, SchemaRef};
+use bytes::Bytes;
 use parquet::arrow::arrow_reader::{
     ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder,
 };
 use parquet::arrow::{ArrowWriter, ProjectionMask};
 use parquet::basic::Compression;
-use parquet::file::metadata::KeyValue;
+use parquet::errors::ParquetError;
+use parquet::file::metadata::{KeyValue, ParquetMetaDataReader};
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
+use parquet::file::reader::{ChunkReader, Length};
 use sha2::{Digest, Sha256};
 use std::fs::File;
-use std::io::{BufReader, BufWriter, Read, Seek, SeekFrom, Write};
+use std::io::{BufReader, BufWriter, Read, Write};
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -33,8 +37,19 @@ use tempfile::NamedTempFile;
 
 /// Key of the checksums in a file's footer: a list of `[first byte, end byte, SHA-256]`, one a row group.
 const CHECKSUMS: &str = "auto_e2h.sha256";
-/// Rows decoded at once: images of a second or ten.
-const BATCH: usize = 256;
+/// Rows decoded at once: images of some seconds.
+const BATCH: usize = 64;
+/// What a footer ends with.
+const MAGIC: &[u8; 4] = b"PAR1";
+/// What a damaged file should have been.
+const WHOLE: &str = "a whole Parquet file";
+/// Values that any file may unpack to, and how many more for each of its bytes. A thousand to one is what the densest common
+/// compression reaches; what promises more is made to fill the memory.
+const VALUES: (u64, u64) = (1 << 24, 1024);
+/// The same in bytes of texts and images.
+const BYTES: (u64, u64) = (1 << 28, 1024);
+/// Snappy makes at most 64 bytes of 3.
+const SNAPPY: u64 = 22;
 
 /// One part of a file that is checked on its own: its bytes and their SHA-256.
 type Checksum = (u64, u64, String);
@@ -42,30 +57,152 @@ type Checksum = (u64, u64, String);
 /// An open Parquet file.
 pub(crate) struct ParquetFile {
     pub(crate) path: PathBuf,
-    file: File,
+    source: Source,
     metadata: ArrowReaderMetadata,
+}
+
+/// The bytes of a file, read by their place: threads that share it do not move each other.
+#[derive(Clone)]
+struct Source {
+    file: Arc<File>,
+    length: u64,
+}
+
+impl Source {
+    /// All bytes from `start` on.
+    fn from(&self, start: u64) -> BufReader<Place> {
+        BufReader::new(Place { source: self.clone(), at: start })
+    }
+
+    fn bytes(&self, start: u64, length: usize) -> std::io::Result<Vec<u8>> {
+        let end = start.checked_add(length as u64);
+        if end.is_none_or(|end| end > self.length) {
+            return Err(std::io::ErrorKind::UnexpectedEof.into());
+        }
+        let mut bytes = vec![0; length];
+        Place { source: self.clone(), at: start }.read_exact(&mut bytes)?;
+        Ok(bytes)
+    }
+}
+
+/// A place in a file.
+struct Place {
+    source: Source,
+    at: u64,
+}
+
+impl Read for Place {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        #[cfg(unix)]
+        let read = std::os::unix::fs::FileExt::read_at(&*self.source.file, bytes, self.at)?;
+        #[cfg(windows)]
+        let read = std::os::windows::fs::FileExt::seek_read(&*self.source.file, bytes, self.at)?;
+        self.at += read as u64;
+        Ok(read)
+    }
+}
+
+impl Length for Source {
+    fn len(&self) -> u64 {
+        self.length
+    }
+}
+
+impl ChunkReader for Source {
+    type T = BufReader<Place>;
+
+    fn get_read(&self, start: u64) -> parquet::errors::Result<Self::T> {
+        Ok(self.from(start))
+    }
+
+    fn get_bytes(&self, start: u64, length: usize) -> parquet::errors::Result<Bytes> {
+        Ok(self.bytes(start, length).map_err(|e| ParquetError::External(e.into()))?.into())
+    }
 }
 
 /// Runs a decoder that this project did not write. Damaged bytes may make it panic; that too is an answer.
 fn guard<T>(path: &Path, what: &str, run: impl FnOnce() -> Result<T>) -> Result<T> {
-    catch_unwind(AssertUnwindSafe(run)).unwrap_or_else(|_| {
-        Err(file_error(path, what, "a whole Parquet file", "bytes that the decoder stumbles over"))
-    })
+    catch_unwind(AssertUnwindSafe(run))
+        .unwrap_or_else(|_| Err(file_error(path, what, WHOLE, "bytes that the decoder stumbles over")))
 }
 
 impl ParquetFile {
     pub(crate) fn open(path: &Path) -> Result<Self> {
         let file = File::open(path).map_err(io("open", path))?;
+        let length = file.metadata().map_err(io("open", path))?.len();
+        let source = Source { file: Arc::new(file), length };
+        let broken = |found: String| file_error(path, "file", WHOLE, found);
+        let footer = footer(&source, path)?;
+        promises::footer(&footer).map_err(broken)?;
         let metadata = guard(path, "file", || {
-            ArrowReaderMetadata::load(&file, ArrowReaderOptions::new())
-                .map_err(|e| file_error(path, "file", "a whole Parquet file", e.to_string()))
+            let metadata = ParquetMetaDataReader::decode_metadata(&footer);
+            let metadata = metadata.map_err(|e| broken(e.to_string()))?;
+            ArrowReaderMetadata::try_new(Arc::new(metadata), ArrowReaderOptions::new())
+                .map_err(|e| broken(e.to_string()))
         })?;
         let rows = metadata.metadata().file_metadata().num_rows();
-        let sum: i64 = metadata.metadata().row_groups().iter().map(|g| g.num_rows()).sum();
-        if rows < 0 || sum != rows || metadata.metadata().row_groups().iter().any(|g| g.num_rows() < 0) {
-            return Err(file_error(path, "file", format!("{rows} rows"), format!("{sum} in its row groups")));
+        let mut groups = metadata.metadata().row_groups().iter().map(|g| u64::try_from(g.num_rows()).ok());
+        let sum = groups.try_fold(0_u64, |sum, rows| sum.checked_add(rows?));
+        if sum.is_none() || sum != u64::try_from(rows).ok() {
+            let found = sum.map_or("others".to_owned(), |sum| sum.to_string());
+            return Err(file_error(
+                path,
+                "file",
+                format!("{rows} rows"),
+                format!("{found} in its row groups"),
+            ));
         }
-        Ok(Self { path: path.to_owned(), file, metadata })
+        let this = Self { path: path.to_owned(), source, metadata };
+        match sum {
+            Some(rows) if rows > this.most(VALUES) => {
+                Err(file_error(path, "file", this.fewer(VALUES, "rows"), format!("{rows}")))
+            }
+            _ => Ok(this),
+        }
+    }
+
+    /// What a file of this size may unpack to.
+    fn most(&self, (any, each): (u64, u64)) -> u64 {
+        self.source.length.saturating_mul(each).saturating_add(any)
+    }
+
+    fn fewer(&self, limit: (u64, u64), what: &str) -> String {
+        format!("at most {} {what} of a file of {} bytes", self.most(limit), self.source.length)
+    }
+
+    /// Looks at the headers of the pages of some columns of a row group, before they are decoded.
+    fn look(&self, group: usize, columns: &ProjectionMask) -> std::result::Result<(), String> {
+        for (i, column) in self.metadata.metadata().row_group(group).columns().iter().enumerate() {
+            if !columns.leaf_included(i) {
+                continue;
+            }
+            let (mut at, length) = column.byte_range();
+            let end = at.checked_add(length).filter(|end| *end <= self.source.length);
+            let Some(end) = end else { return Err(format!("a column of {length} bytes from byte {at} on")) };
+            let mut values = 0_u64;
+            while at < end {
+                let page = promises::page(self.source.from(at), end - at)?;
+                let left = end - at - page.header;
+                if page.stored > left {
+                    return Err(format!("a page of {} bytes where {left} are left", page.stored));
+                }
+                let snappy = matches!(column.compression(), Compression::SNAPPY | Compression::UNCOMPRESSED);
+                if snappy && page.unpacked > page.stored.saturating_mul(SNAPPY).saturating_add(64) {
+                    let Page { unpacked, stored, .. } = page;
+                    return Err(format!("a page of {unpacked} bytes packed into {stored}"));
+                }
+                values = if page.dictionary {
+                    values.max(page.values)
+                } else {
+                    values.saturating_add(page.values)
+                };
+                if values > self.most(VALUES) {
+                    return Err(format!("{values} values, expected {}", self.fewer(VALUES, "values")));
+                }
+                at += page.header + page.stored;
+            }
+        }
+        Ok(())
     }
 
     pub(crate) fn rows(&self) -> usize {
@@ -109,12 +246,15 @@ impl ParquetFile {
         };
         let mut next = rows.start;
         let result = guard(&self.path, &what(rows.start), || {
-            let file = self.file.try_clone().map_err(io("open", &self.path))?;
-            let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file, self.metadata.clone());
+            let (source, metadata) = (self.source.clone(), self.metadata.clone());
+            let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(source, metadata);
             let schema = builder.schema().clone();
             let places = columns.iter().filter_map(|c| schema.index_of(c).ok());
             let mask = ProjectionMask::roots(builder.parquet_schema(), places);
             let broken = |from, e: String| file_error(&self.path, &what(from), "readable values", e);
+            for &group in &wanted {
+                self.look(group, &mask).map_err(|e| broken(rows.start, e))?;
+            }
             let reader = builder
                 .with_projection(mask)
                 .with_row_groups(wanted)
@@ -150,13 +290,19 @@ impl ParquetFile {
     ) -> Result<Vec<(String, Column)>> {
         let names: Vec<&str> = features.iter().map(|(n, _)| *n).collect();
         let mut out: Vec<Column> = features.iter().map(|(_, f)| Column::empty(f.dtype)).collect();
+        let mut bytes = 0;
         self.batches(&names, rows, &mut |batch, first| {
             for ((name, feature), column) in features.iter().zip(&mut out) {
                 let array = batch.column_by_name(name).ok_or_else(|| {
                     file_error(&self.path, &format!("column `{name}`"), "one", "none in this batch")
                 })?;
-                let place = Place { path: &self.path, column: name, first };
-                column.append(from_arrow(array, feature, &place)?);
+                let place = Cell { path: &self.path, column: name, first };
+                let piece = from_arrow(array, feature, &place)?;
+                bytes += piece.bytes() as u64;
+                if bytes > self.most(BYTES) {
+                    return Err(place.error(None, self.fewer(BYTES, "bytes"), format!("more: {bytes}")));
+                }
+                column.append(piece);
             }
             Ok(())
         })?;
@@ -175,7 +321,6 @@ impl ParquetFile {
         if sums.len() != groups {
             return Err(bad(format!("{} for {groups}", sums.len())));
         }
-        let mut file = BufReader::new(&self.file);
         let read = io("read", &self.path);
         let mut damaged = vec![];
         let mut place = 0;
@@ -184,9 +329,9 @@ impl ParquetFile {
                 return Err(bad(format!("bytes {start} to {end}")));
             }
             place = end;
-            file.seek(SeekFrom::Start(start)).map_err(&read)?;
             let mut hash = Sha256::new();
-            let copied = std::io::copy(&mut (&mut file).take(end - start), &mut hash).map_err(&read)?;
+            let mut group = self.source.from(start).take(end - start);
+            let copied = std::io::copy(&mut group, &mut hash).map_err(&read)?;
             if copied != end - start || hex(&hash.finalize()) != sum {
                 damaged.push(i);
             }
@@ -198,6 +343,7 @@ impl ParquetFile {
     pub(crate) fn group_rows(&self, i: usize) -> Range<usize> {
         let groups = self.metadata.metadata().row_groups();
         let rows = |g: &[parquet::file::metadata::RowGroupMetaData]| -> usize {
+            // Their sum has been looked at when the file was opened.
             g.iter().map(|g| usize::try_from(g.num_rows()).unwrap_or(0)).sum()
         };
         rows(&groups[..i])..rows(&groups[..=i])
@@ -225,6 +371,25 @@ impl ParquetFile {
 
     fn schema(&self) -> SchemaRef {
         self.metadata.schema().clone()
+    }
+}
+
+/// The bytes of a footer: what its last eight bytes say of it.
+fn footer(source: &Source, path: &Path) -> Result<Vec<u8>> {
+    let broken = |found: String| file_error(path, "file", WHOLE, found);
+    let read = io("read", path);
+    if source.length < 12 {
+        return Err(broken(format!("{} bytes", source.length)));
+    }
+    let end = source.bytes(source.length - 8, 8).map_err(&read)?;
+    let (length, magic) = end.split_at(4);
+    if magic != MAGIC {
+        return Err(broken(format!("an end of {magic:?}")));
+    }
+    let length = length.first_chunk().map_or(0, |b| u32::from_le_bytes(*b));
+    match (source.length - 8).checked_sub(length.into()) {
+        Some(start) if start >= 4 => source.bytes(start, length as usize).map_err(&read),
+        _ => Err(broken(format!("a footer of {length} bytes in a file of {}", source.length))),
     }
 }
 
@@ -322,13 +487,13 @@ fn write_error(path: &Path) -> impl Fn(parquet::errors::ParquetError) -> Error {
 }
 
 /// Where a value lies, for messages.
-struct Place<'a> {
+struct Cell<'a> {
     path: &'a Path,
     column: &'a str,
     first: usize,
 }
 
-impl Place<'_> {
+impl Cell<'_> {
     fn error(&self, row: Option<usize>, expected: impl Into<String>, found: impl Into<String>) -> Error {
         let what = match row {
             Some(row) => format!("column `{}`, row {}", self.column, self.first + row),
@@ -347,7 +512,7 @@ impl Place<'_> {
 }
 
 /// A column from Arrow. Lists are unpacked by the feature's shape.
-fn from_arrow(array: &ArrayRef, feature: &Feature, place: &Place) -> Result<Column> {
+fn from_arrow(array: &ArrayRef, feature: &Feature, place: &Cell) -> Result<Column> {
     if feature.dtype == Dtype::Image {
         return images(array, place);
     }
@@ -404,7 +569,7 @@ fn is_list(kind: &DataType) -> bool {
 }
 
 /// The children of lists that must all have `size` of them.
-fn unpack(array: &ArrayRef, size: usize, width: usize, feature: &Feature, place: &Place) -> Result<ArrayRef> {
+fn unpack(array: &ArrayRef, size: usize, width: usize, feature: &Feature, place: &Cell) -> Result<ArrayRef> {
     place.whole(array.as_ref(), width)?;
     let row = |i: usize, found: usize| {
         Err(place.error(Some(i / width.max(1)), format!("{size} entries"), found.to_string()))
@@ -442,7 +607,7 @@ fn unpack(array: &ArrayRef, size: usize, width: usize, feature: &Feature, place:
     }
 }
 
-fn images(array: &ArrayRef, place: &Place) -> Result<Column> {
+fn images(array: &ArrayRef, place: &Cell) -> Result<Column> {
     let kind = || place.error(None, "images as struct<bytes, path>", array.data_type().to_string());
     let bytes = match array.data_type() {
         DataType::Struct(_) => {

@@ -4,6 +4,11 @@ use crate::Result;
 use crate::file::file_error;
 use std::path::Path;
 
+/// Bytes that one byte of a PNG file makes at most, by how it is packed.
+const DENSEST: usize = 1032;
+/// Bytes of pixels that no file is refused for.
+const SMALL: usize = 1 << 16;
+
 /// An RGB image, 8 bits a channel, as a PNG file.
 ///
 /// # Shapes
@@ -57,6 +62,9 @@ pub(super) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, wha
         return Err(bad(format!("{} x {}", header.height, header.width)));
     }
     let mut reader = decoder.read_info().map_err(broken)?;
+    if reader.info().raw_bytes() > bytes.len().saturating_mul(DENSEST).saturating_add(SMALL) {
+        return Err(bad(format!("{} bytes, too few for it", bytes.len())));
+    }
     let size = reader.output_buffer_size().ok_or_else(|| bad("more pixels than memory".to_owned()))?;
     let mut data = vec![0; size];
     let frame = reader.next_frame(&mut data).map_err(broken)?;
@@ -115,6 +123,11 @@ mod tests {
         let mut png = encode(1, 1, &[1, 2, 3]).unwrap();
         png[16..24].copy_from_slice(&[0x7f, 0xff, 0xff, 0xff, 0x7f, 0xff, 0xff, 0xff]);
         assert!(from(&png, 1, 1).is_err());
+        // The size that is asked for, and next to nothing behind it.
+        let whole = encode(4000, 4000, &vec![7; 4000 * 4000 * 3]).unwrap();
+        assert_eq!(from(&whole, 4000, 4000).unwrap().len(), 4000 * 4000 * 3);
+        let message = from(&whole[..100], 4000, 4000).unwrap_err().to_string();
+        assert_eq!(message, "x: row 0: expected a PNG image of 4000 x 4000, found 100 bytes, too few for it");
     }
 
     proptest! {

@@ -2,6 +2,7 @@
 
 use super::feature::{Dtype, Feature, Features};
 use crate::{Error, Result};
+use e2h_core::one_line;
 
 /// One column of one episode. Rows lie one after the other; a row has [`Feature::width`] numbers.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,6 +66,18 @@ impl Column {
             Self::Bool(v) => Self::Bool(pick(v, rows, width)),
             Self::Text(v) => Self::Text(pick(v, rows, 1)),
             Self::Png(v) => Self::Png(pick(v, rows, 1)),
+        }
+    }
+
+    /// Bytes of its numbers, texts or images.
+    pub(crate) fn bytes(&self) -> usize {
+        match self {
+            Self::F32(v) => size_of_val(&v[..]),
+            Self::F64(v) => size_of_val(&v[..]),
+            Self::I64(v) => size_of_val(&v[..]),
+            Self::Bool(v) => v.len(),
+            Self::Text(v) => v.iter().map(String::len).sum(),
+            Self::Png(v) => v.iter().map(Vec::len).sum(),
         }
     }
 
@@ -190,7 +203,11 @@ fn unlike(name: &str, expected: impl Into<String>, found: Option<&Column>) -> Er
 }
 
 pub(crate) fn column_error(column: &str, expected: impl Into<String>, found: impl Into<String>) -> Error {
-    Error::Column { column: column.to_owned(), expected: expected.into(), found: found.into() }
+    Error::Column {
+        column: one_line(column),
+        expected: one_line(&expected.into()),
+        found: one_line(&found.into()),
+    }
 }
 
 /// Least and largest integer of a type; none for what is no integer.

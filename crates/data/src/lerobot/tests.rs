@@ -227,6 +227,23 @@ fn what_does_not_fit_is_refused_by_name() {
 }
 
 #[test]
+fn threads_read_a_dataset_side_by_side() {
+    let (_folder, root) = place();
+    written(&root, 12).finish().unwrap();
+    let dataset = Dataset::open(&root).unwrap();
+    std::thread::scope(|scope| {
+        for first in 0..4 {
+            let dataset = &dataset;
+            scope.spawn(move || {
+                for n in (0..12).cycle().skip(first * 3).take(60) {
+                    assert_eq!(dataset.read_episode(n).unwrap(), numbered(n));
+                }
+            });
+        }
+    });
+}
+
+#[test]
 fn fates_and_tables_of_others() {
     let e = numbered(2);
     let table = to_table(&e, &[0, 2, 0, 1, 0]).unwrap();
@@ -456,6 +473,75 @@ fn a_foreign_column_type_is_named_with_its_column() {
     std::fs::write(root.join("meta/info.json"), wrong).unwrap();
     let message = Dataset::open(&root).unwrap().read(0).unwrap_err().to_string();
     assert!(message.contains("column `action`, row 0: expected 9 entries, found 8"), "{message}");
+}
+
+/// A Parquet file of nothing but a footer whose schema promises more columns than there is memory for.
+#[test]
+fn a_file_that_promises_more_than_it_holds_is_refused_before_there_is_memory_for_it() {
+    let (_folder, root) = place();
+    written(&root, 1).finish().unwrap();
+    // Version 2; a schema of one element, `a`, with 2^31 - 1 children.
+    let footer = [0x15, 4, 0x19, 0x1c, 0x48, 1, b'a', 0x15, 0xfe, 0xff, 0xff, 0xff, 0x0f, 0, 0];
+    let file = [b"PAR1", &footer[..], &(footer.len() as u32).to_le_bytes(), b"PAR1"].concat();
+    let path = data_file(&root, 0);
+    std::fs::write(&path, &file).unwrap();
+    let message = Dataset::open(&root).unwrap().read(0).unwrap_err().to_string();
+    let expected =
+        "file: expected a whole Parquet file, found a group of 2147483647 columns in a schema of 1";
+    assert_eq!(message, format!("{}: {expected}", path.display()));
+    assert!(faults(&root)[0].contains("a group of 2147483647 columns"));
+}
+
+/// Pages that say they unpack to more than they can, and columns that say they have more pages than the file.
+#[test]
+fn pages_that_promise_more_than_they_hold_are_refused_before_there_is_memory_for_them() {
+    let (_folder, root) = place();
+    written(&root, 1).finish().unwrap();
+    let path = data_file(&root, 0);
+    let good = std::fs::read(&path).unwrap();
+    // The first page's header begins with its kind and both sizes; the first of them is that in memory.
+    let (kind, sizes) = (&good[4..6], &good[6..9]);
+    assert!(kind[0] == 0x15 && sizes[0] == 0x15 && sizes[1] >= 0x80 && sizes[2] < 0x80, "{:?}", &good[..16]);
+    let mut bad = good.clone();
+    bad[7..9].copy_from_slice(&[0xfe, 0x7f]);
+    std::fs::write(&path, &bad).unwrap();
+    let message = Dataset::open(&root).unwrap().read(0).unwrap_err().to_string();
+    assert!(message.contains("column `observation.state`, from row 0"), "{message}");
+    assert!(message.contains("a page of 8191 bytes packed into"), "{message}");
+}
+
+/// Names and texts of others stand in messages, which stay one line.
+#[test]
+fn what_files_say_does_not_break_a_message() {
+    let (_folder, root) = place();
+    written(&root, 1).finish().unwrap();
+    let text = std::fs::read_to_string(root.join("meta/info.json")).unwrap();
+    let refusal = |from: &str, to: &str| {
+        assert!(text.contains(from), "{from}");
+        std::fs::write(root.join("meta/info.json"), text.replacen(from, to, 1)).unwrap();
+        let message = Dataset::open(&root).unwrap_err().to_string();
+        assert!(!message.contains(char::is_control) && message.contains("info.json"), "{message:?}");
+        message
+    };
+    refusal("\"bool\"", "\"b\\no\\u001b[31mol\"");
+    assert!(refusal("\"action\"", "\"act\\nion\"").contains("control characters"));
+    assert!(refusal("data/chunk", "data/\\nchunk").contains("data_path"));
+    let long = refusal("\"v3.0\"", &format!("\"{}\"", "x".repeat(1 << 20)));
+    assert!(long.len() < 2000, "{}", long.len());
+}
+
+/// What cannot be an episode of this project is refused with the name of the file.
+#[test]
+fn a_foreign_dataset_is_no_episode_and_says_which_file() {
+    let (_folder, root) = place();
+    let own = vec![("x".to_owned(), Feature::scalar(Dtype::Float32))];
+    let mut writer = Writer::create(&root, 20.0, None, own).unwrap();
+    let columns = vec![("x".to_owned(), Column::F32(vec![1.0]))];
+    writer.push(&Table { rows: 1, columns }, "t").unwrap();
+    writer.finish().unwrap();
+    let message = Dataset::open(&root).unwrap().read_episode(0).unwrap_err().to_string();
+    let name = data_file(&root, 0).display().to_string();
+    assert_eq!(message, format!("{name}: episode 0, column `source.success_at`: expected int64, found none"));
 }
 
 /// A dataset with damage in one of its files, and what all readers say of it: errors, but no panic and no hang.

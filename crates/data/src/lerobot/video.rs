@@ -4,12 +4,19 @@ use super::feature::Feature;
 use super::picture;
 use crate::file::file_error;
 use crate::{Error, Result};
+use std::ffi::OsString;
 use std::io::{Read, Seek};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// Names the decoder when it is not called `ffmpeg` or not on the path.
 const PROGRAM: &str = "E2H_FFMPEG";
+
+fn prefixed(prefix: &str, path: &Path) -> OsString {
+    let mut whole = OsString::from(prefix);
+    whole.push(path);
+    whole
+}
 
 /// `count` frames from `from` seconds on, as PNG files.
 pub(crate) fn read(
@@ -27,7 +34,10 @@ pub(crate) fn read(
     let start = (from - 0.5 / fps).max(0.0);
     let program = std::env::var_os(PROGRAM).unwrap_or_else(|| "ffmpeg".into());
     let mut command = Command::new(&program);
-    command.args(["-v", "error", "-nostdin", "-ss", &format!("{start:.6}"), "-i"]).arg(path);
+    command.args(["-v", "error", "-nostdin", "-ss", &format!("{start:.6}")]);
+    // The file is what its name says: ffmpeg goes by the content, and what it takes for a playlist may name other files of
+    // this machine, and addresses.
+    command.args(["-protocol_whitelist", "file", "-f", "mp4", "-i"]).arg(prefixed("file:", path));
     command.args(["-frames:v", &count.to_string(), "-fps_mode", "passthrough"]);
     command.args(["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]);
     let failed = |found: String| Error::Video {
@@ -44,7 +54,7 @@ pub(crate) fn read(
         .stderr(stderr)
         .spawn()
         .map_err(|e| failed(format!("{}: {e}", program.to_string_lossy())))?;
-    let mut frames = Vec::with_capacity(count);
+    let mut frames = vec![];
     let mut frame = vec![0; height * width * 3];
     if let Some(mut out) = child.stdout.take() {
         while frames.len() < count && out.read_exact(&mut frame).is_ok() {

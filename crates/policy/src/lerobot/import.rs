@@ -5,10 +5,9 @@ use super::export::{HEADER, Header};
 use super::policy::LerobotPolicy;
 use super::processors::{POSTPROCESSOR, PREPROCESSOR, Statistics};
 use super::{ACTION, CONFIG_FILE, ENVIRONMENT, POSITION_GRID, STATE, WEIGHTS_FILE};
+use crate::checkpoint::read_weights;
 use crate::model::{DiffusionModel, Widths};
 use crate::{Ddim, Error, ImageScaling, PolicyConfig, Prediction, Result, SamplerKind};
-use e2h_core::stream;
-use e2h_nn::{Compute, Mode};
 use std::path::Path;
 
 /// Opens a diffusion policy that LeRobot 0.4.4 or [`super::export`] wrote.
@@ -55,19 +54,11 @@ pub fn import(dir: &Path) -> Result<LerobotPolicy> {
     }
 
     let widths = Widths { state: s + e, action: a };
-    let model = DiffusionModel::of_widths(
-        &Compute::cpu(),
-        &config,
-        widths,
-        Mode::Infer,
-        &mut stream(0, "weights", 0, 0),
-    )?;
+    config.validate().map_err(|e| Error::Checkpoint { path: path.clone(), problem: e.to_string() })?;
     let weights_path = dir.join(WEIGHTS_FILE);
-    let (mut weights, metadata) = e2h_nn::load_weights(&weights_path)?;
+    let (mut weights, metadata) = read_weights(&weights_path)?;
     weights.retain(|name, _| !name.ends_with(POSITION_GRID));
-    model
-        .params
-        .import(&weights)
+    let model = DiffusionModel::with_weights(&config, widths, &weights)
         .map_err(|e| Error::Checkpoint { path: weights_path, problem: e.to_string() })?;
     let header = metadata.get(HEADER).and_then(|text| serde_json::from_str::<Header>(text).ok());
     Ok(LerobotPolicy {
@@ -84,6 +75,9 @@ pub fn import(dir: &Path) -> Result<LerobotPolicy> {
         provenance: header.map(|h| h.provenance),
     })
 }
+
+/// Numbers that a state or an action may have, and sides of an image.
+const WIDEST: usize = 1 << 16;
 
 /// What goes in and comes out.
 struct Features {
@@ -102,10 +96,10 @@ impl Features {
             .find(|(n, _)| n == name)
             .map(|(_, f)| &f.shape[..])
         {
-            Some(&[n]) if n > 0 => n,
+            Some(&[n]) if n > 0 && n <= WIDEST => n,
             None if !needed => 0,
             found => {
-                problems.push(Obstacle::new(name, "a vector", format!("{found:?}")));
+                problems.push(Obstacle::new(name, "a vector of up to 65536 numbers", format!("{found:?}")));
                 0
             }
         };
@@ -117,7 +111,7 @@ impl Features {
         let mut size = [0; 2];
         for (name, feature) in &images {
             match feature.shape[..] {
-                [3, h, w] if size == [0; 2] || size == [h, w] => size = [h, w],
+                [3, h, w] if h.max(w) <= WIDEST && (size == [0; 2] || size == [h, w]) => size = [h, w],
                 _ => problems.push(Obstacle::new(
                     name,
                     "3 channels and the same size in all cameras",
@@ -126,8 +120,8 @@ impl Features {
             }
         }
         let crop = d.crop_shape.unwrap_or(size);
-        if !images.is_empty() && (crop[0] > size[0] || crop[1] > size[1]) {
-            problems.push(Obstacle::new("crop_shape", format!("at most {size:?}"), format!("{crop:?}")));
+        if !images.is_empty() && (crop[0] > size[0] || crop[1] > size[1] || crop.contains(&0)) {
+            problems.push(Obstacle::new("crop_shape", format!("1 to {size:?}"), format!("{crop:?}")));
         }
         if !images.is_empty() && environment > 0 {
             problems.push(Obstacle::new(
@@ -184,7 +178,7 @@ fn network(d: &Description, features: &Features, problems: &mut Vec<Obstacle>) -
         encoder_width: BACKBONE_WIDTH,
         encoder_blocks: blocks.unwrap_or([2; 4]).to_vec(),
         keypoints: d.spatial_softmax_num_keypoints,
-        image_features: 2 * d.spatial_softmax_num_keypoints,
+        image_features: d.spatial_softmax_num_keypoints.saturating_mul(2),
         relative_features: false,
         down_dims: d.down_dims.clone(),
         kernel_size: d.kernel_size,

@@ -214,7 +214,8 @@ impl LerobotPolicy {
             action_min: std::array::from_fn(|i| action.range(i, true).0),
             action_max: std::array::from_fn(|i| action.range(i, true).1),
         }
-        .check()?;
+        .check()
+        .map_err(|e| Error::Checkpoint { path: self.path.clone(), problem: e.to_string() })?;
         let plain = ImageScaling { mean: [0.0; 3], std: [1.0; 3] };
         let scaled = self.cameras.iter().any(|(_, s)| *s != plain);
         let name =
@@ -226,7 +227,8 @@ impl LerobotPolicy {
             image_scaling: if scaled { self.cameras.iter().map(|c| c.1.clone()).collect() } else { vec![] },
             ..self.config
         };
-        let policy = DiffusionPolicy::with_weights(&config, &normaliser, &self.model.params.export()?)?;
+        let policy = DiffusionPolicy::with_weights(&config, &normaliser, &self.model.params.export()?)
+            .map_err(|e| Error::Checkpoint { path: self.path, problem: e.to_string() })?;
         let provenance = self.provenance.unwrap_or_else(|| Provenance {
             preset: "lerobot".to_owned(),
             version: env!("CARGO_PKG_VERSION").to_owned(),

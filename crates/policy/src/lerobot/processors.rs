@@ -173,7 +173,11 @@ impl Statistics {
             let tensor = self.tensors.get(&format!("{feature}.{name}"));
             let finite = |t: &&HostTensor| t.data.len() == width && t.data.iter().all(|v| v.is_finite());
             tensor.filter(finite).map(|t| t.data.clone()).unwrap_or_else(|| {
-                let found = tensor.map_or("none".to_owned(), |t| format!("{} {:?}", t.data.len(), t.data));
+                let all = |t: &HostTensor| {
+                    let bad = t.data.iter().find(|v| !v.is_finite());
+                    format!("{} numbers{}", t.data.len(), bad.map_or(String::new(), |v| format!(", one {v}")))
+                };
+                let found = tensor.map_or("none".to_owned(), all);
                 obstacles.push(Obstacle::new(
                     &format!("{feature}.{name}"),
                     format!("{width} finite numbers"),

@@ -1,0 +1,459 @@
+//! What a Parquet file promises, looked at before the decoder believes it.
+//!
+//! The decoder takes memory for as many columns, bytes and values as the file's own headers name, and goes as deep as its
+//! schema does. A file of a hundred bytes may so ask for sixteen gigabytes or overflow the stack, and neither can be caught.
+//! Headers are Thrift's compact protocol; they are walked here by their published layout, and one that does not keep to it is
+//! refused, because the decoder might read it otherwise.
+//!
+//! # Source
+//! `parquet.thrift` of parquet-format 2.12, and the specification of Thrift's compact protocol.
+
+use std::io::Read;
+
+/// What a header's field holds.
+enum Kind {
+    Bool,
+    Byte,
+    /// 16, 32 or 64 bits; all are written alike.
+    Int,
+    Double,
+    Binary,
+    List(&'static Kind),
+    Struct(&'static [(i16, Kind)]),
+    /// A structure that the decoder passes over as a whole.
+    Any,
+}
+
+use Kind::{Any, Binary, Bool, Byte, Double, Int, List, Struct};
+
+const EMPTY: Kind = Struct(&[]);
+const UNIT: Kind = Struct(&[(1, EMPTY), (2, EMPTY), (3, EMPTY)]);
+const MOMENT: Kind = Struct(&[(1, Bool), (2, UNIT)]);
+const LOGICAL: Kind = Struct(&[
+    (1, EMPTY),
+    (2, EMPTY),
+    (3, EMPTY),
+    (4, EMPTY),
+    (5, Struct(&[(1, Int), (2, Int)])),
+    (6, EMPTY),
+    (7, MOMENT),
+    (8, MOMENT),
+    (10, Struct(&[(1, Byte), (2, Bool)])),
+    (11, EMPTY),
+    (12, EMPTY),
+    (13, EMPTY),
+    (14, EMPTY),
+    (15, EMPTY),
+    (16, Struct(&[(1, Byte)])),
+    (17, Struct(&[(1, Binary)])),
+    (18, Struct(&[(1, Binary), (2, Int)])),
+]);
+/// Children of a schema's element.
+const CHILDREN: i16 = 5;
+const ELEMENT: Kind = Struct(&[
+    (1, Int),
+    (2, Int),
+    (3, Int),
+    (4, Binary),
+    (CHILDREN, Int),
+    (6, Int),
+    (7, Int),
+    (8, Int),
+    (9, Int),
+    (10, LOGICAL),
+]);
+const ENTRY: Kind = Struct(&[(1, Binary), (2, Binary)]);
+const STATISTICS: Kind = Struct(&[
+    (1, Binary),
+    (2, Binary),
+    (3, Int),
+    (4, Int),
+    (5, Binary),
+    (6, Binary),
+    (7, Bool),
+    (8, Bool),
+    (9, Int),
+]);
+const SIZES: Kind = Struct(&[(1, Int), (2, List(&Int)), (3, List(&Int))]);
+const BOX: Kind = Struct(&[
+    (1, Double),
+    (2, Double),
+    (3, Double),
+    (4, Double),
+    (5, Double),
+    (6, Double),
+    (7, Double),
+    (8, Double),
+]);
+const COLUMN: Kind = Struct(&[
+    (1, Int),
+    (2, List(&Int)),
+    (3, List(&Binary)),
+    (4, Int),
+    (5, Int),
+    (6, Int),
+    (7, Int),
+    (8, List(&ENTRY)),
+    (9, Int),
+    (10, Int),
+    (11, Int),
+    (12, STATISTICS),
+    (13, List(&Struct(&[(1, Int), (2, Int), (3, Int)]))),
+    (14, Int),
+    (15, Int),
+    (16, SIZES),
+    (17, Struct(&[(1, BOX), (2, List(&Int))])),
+]);
+const CHUNK: Kind = Struct(&[
+    (1, Binary),
+    (2, Int),
+    (3, COLUMN),
+    (4, Int),
+    (5, Int),
+    (6, Int),
+    (7, Int),
+    (8, Any),
+    (9, Binary),
+]);
+const GROUP: Kind = Struct(&[
+    (1, List(&CHUNK)),
+    (2, Int),
+    (3, Int),
+    (4, List(&Struct(&[(1, Int), (2, Bool), (3, Bool)]))),
+    (5, Int),
+    (6, Int),
+    (7, Int),
+]);
+/// The schema in a footer.
+const SCHEMA: i16 = 2;
+const FOOTER: &[(i16, Kind)] = &[
+    (1, Int),
+    (SCHEMA, List(&ELEMENT)),
+    (3, Int),
+    (4, List(&GROUP)),
+    (5, List(&ENTRY)),
+    (6, Binary),
+    (7, List(&Struct(&[(1, EMPTY), (2, EMPTY)]))),
+    (8, Any),
+    (9, Binary),
+];
+const PAGE: &[(i16, Kind)] = &[
+    (1, Int),
+    (2, Int),
+    (3, Int),
+    (4, Int),
+    (5, Struct(&[(1, Int), (2, Int), (3, Int), (4, Int), (5, Any)])),
+    (6, EMPTY),
+    (7, Struct(&[(1, Int), (2, Int), (3, Bool)])),
+    (8, Struct(&[(1, Int), (2, Int), (3, Int), (4, Int), (5, Int), (6, Int), (7, Bool), (8, Any)])),
+];
+
+/// Levels of a schema; LeRobot's deepest column, an image's statistics, has nine.
+const DEEPEST: usize = 40;
+/// Levels of a structure that is passed over.
+const DEEPEST_SKIPPED: usize = 16;
+
+/// What is wrong, in words.
+type Wrong = String;
+
+fn wrong<T>(what: impl Into<Wrong>) -> Result<T, Wrong> {
+    Err(what.into())
+}
+
+/// What reads a field: gets its number, its type on the wire, and its kind.
+type Each<'a, W> = dyn FnMut(&mut W, i16, u8, &'static Kind) -> Result<(), Wrong> + 'a;
+
+/// Reads headers; never beyond its bytes.
+struct Walker<R> {
+    input: R,
+    /// Bytes that are left.
+    left: u64,
+}
+
+impl<R: Read> Walker<R> {
+    fn byte(&mut self) -> Result<u8, Wrong> {
+        let mut byte = [0];
+        if self.left == 0 || self.input.read_exact(&mut byte).is_err() {
+            return wrong("a header that is cut off");
+        }
+        self.left -= 1;
+        Ok(byte[0])
+    }
+
+    fn pass(&mut self, bytes: u64) -> Result<(), Wrong> {
+        let copied = std::io::copy(&mut (&mut self.input).take(bytes.min(self.left)), &mut std::io::sink());
+        if bytes > self.left || copied.ok() != Some(bytes) {
+            return wrong(format!("a text of {bytes} bytes where {} are left", self.left));
+        }
+        self.left -= bytes;
+        Ok(())
+    }
+
+    /// A number of up to 64 bits, seven of them a byte.
+    fn number(&mut self) -> Result<u64, Wrong> {
+        let mut value = 0;
+        for shift in (0..64).step_by(7) {
+            let byte = self.byte()?;
+            value |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return Ok(value);
+            }
+        }
+        wrong("a number of more than 64 bits")
+    }
+
+    fn signed(&mut self) -> Result<i64, Wrong> {
+        let value = self.number()?;
+        Ok((value >> 1).cast_signed() ^ -(value & 1).cast_signed())
+    }
+
+    /// Type and length of a list.
+    fn list(&mut self) -> Result<(u8, u64), Wrong> {
+        let head = self.byte()?;
+        let length = if head >> 4 == 15 { self.number()? } else { u64::from(head >> 4) };
+        if length > self.left {
+            return wrong(format!("a list of {length} entries in {} bytes", self.left));
+        }
+        Ok((head & 15, length))
+    }
+
+    /// The fields of a structure, in the order of their numbers; `each` has to read the field.
+    fn fields(&mut self, known: &'static [(i16, Kind)], each: &mut Each<'_, Self>) -> Result<(), Wrong> {
+        let mut last = 0_i16;
+        loop {
+            let head = self.byte()?;
+            let wire = head & 15;
+            if wire == 0 {
+                return if head == 0 { Ok(()) } else { wrong("a structure without an end") };
+            }
+            let step = i64::from(head >> 4);
+            let id = if step == 0 { self.signed()? } else { i64::from(last) + step };
+            let id = i16::try_from(id).ok().filter(|id| *id > last);
+            let Some(id) = id else { return wrong("fields out of order") };
+            last = id;
+            let kind = known.iter().find(|(n, _)| *n == id).map_or(&Any, |(_, kind)| kind);
+            each(self, id, wire, kind)?;
+        }
+    }
+
+    /// Passes over a value that has to be of `kind`; `wire` is its type.
+    fn value(&mut self, wire: u8, kind: &'static Kind, in_list: bool) -> Result<(), Wrong> {
+        match (kind, wire) {
+            (Any, wire) => self.any(wire, in_list, 0),
+            (Bool, 1 | 2) if !in_list => Ok(()),
+            (Bool, 1 | 2) | (Byte, 3) => self.pass(1),
+            (Int, 4..=6) => self.number().map(|_| ()),
+            (Double, 7) => self.pass(8),
+            (Binary, 8) => {
+                let length = self.number()?;
+                self.pass(length)
+            }
+            (List(kind), 9) => {
+                let (wire, length) = self.list()?;
+                (0..length).try_for_each(|_| self.value(wire, kind, true))
+            }
+            (Struct(known), 12) => {
+                self.fields(known, &mut |this, _, wire, kind| this.value(wire, kind, false))
+            }
+            (_, wire) => wrong(format!("a header's field of type {wire}, which is another's")),
+        }
+    }
+
+    /// Passes over whatever there is.
+    fn any(&mut self, wire: u8, in_list: bool, depth: usize) -> Result<(), Wrong> {
+        if depth > DEEPEST_SKIPPED {
+            return wrong("structures within structures without end");
+        }
+        match wire {
+            1 | 2 if !in_list => Ok(()),
+            1..=3 => self.pass(1),
+            4..=6 => self.number().map(|_| ()),
+            7 => self.pass(8),
+            8 => {
+                let length = self.number()?;
+                self.pass(length)
+            }
+            9 | 10 => {
+                let (wire, length) = self.list()?;
+                (0..length).try_for_each(|_| self.any(wire, true, depth + 1))
+            }
+            12 => self.fields(&[], &mut |this, _, wire, _| this.any(wire, false, depth + 1)),
+            // Parquet has no maps.
+            _ => wrong(format!("a header's field of unknown type {wire}")),
+        }
+    }
+}
+
+/// Checks a footer: its structures end, and its schema is not deeper than any table is.
+pub(super) fn footer(bytes: &[u8]) -> Result<(), Wrong> {
+    let mut walker = Walker { input: bytes, left: bytes.len() as u64 };
+    walker.fields(FOOTER, &mut |walker, id, wire, kind| {
+        if id == SCHEMA && wire == 9 { schema(walker) } else { walker.value(wire, kind, false) }
+    })
+}
+
+/// A schema is a list of elements; a group's children follow it.
+fn schema<R: Read>(walker: &mut Walker<R>) -> Result<(), Wrong> {
+    let (wire, length) = walker.list()?;
+    let Struct(known) = &ELEMENT else { return Ok(()) };
+    if wire != 12 {
+        return wrong("a schema of no structures");
+    }
+    // Children that are still to come, of each group that is open.
+    let mut open: Vec<u64> = vec![];
+    for element in 0..length {
+        let mut children = 0;
+        walker.fields(known, &mut |walker, id, wire, kind| {
+            if id == CHILDREN && (4..=6).contains(&wire) {
+                children = walker.signed()?;
+                return Ok(());
+            }
+            walker.value(wire, kind, false)
+        })?;
+        match u64::try_from(children) {
+            Ok(0) => {}
+            Ok(children) if children < length - element && open.len() < DEEPEST => {
+                open.push(children);
+                continue;
+            }
+            Ok(children) if open.len() < DEEPEST => {
+                return wrong(format!("a group of {children} columns in a schema of {length}"));
+            }
+            Ok(_) => return wrong(format!("columns more than {DEEPEST} levels deep")),
+            Err(_) => return wrong(format!("a group of {children} columns")),
+        }
+        // This one is done, and with it every group whose last child it was.
+        while let Some(left) = open.last_mut() {
+            *left -= 1;
+            if *left > 0 {
+                break;
+            }
+            open.pop();
+        }
+    }
+    Ok(())
+}
+
+/// What the header of a page says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Page {
+    /// Bytes of the header itself.
+    pub(super) header: u64,
+    /// Bytes of the page in the file.
+    pub(super) stored: u64,
+    /// Bytes of it in memory.
+    pub(super) unpacked: u64,
+    /// Values in it; for a page of a dictionary, those of the dictionary.
+    pub(super) values: u64,
+    pub(super) dictionary: bool,
+}
+
+/// Reads the header of a page; `left` bytes are left of its column.
+pub(super) fn page(input: impl Read, left: u64) -> Result<Page, Wrong> {
+    let mut walker = Walker { input, left };
+    let mut page = Page::default();
+    let size = |v: i64| u64::try_from(v).map_err(|_| format!("a page of {v} bytes or values"));
+    walker.fields(PAGE, &mut |walker, id, wire, kind| match (id, kind, wire) {
+        (2 | 3, _, 4..=6) => {
+            let slot = if id == 2 { &mut page.unpacked } else { &mut page.stored };
+            *slot = size(walker.signed()?)?;
+            Ok(())
+        }
+        (5 | 7 | 8, Struct(known), 12) => {
+            page.dictionary |= id == 7;
+            walker.fields(known, &mut |walker, inner, wire, kind| {
+                if inner == 1 && (4..=6).contains(&wire) {
+                    page.values = page.values.max(size(walker.signed()?)?);
+                    return Ok(());
+                }
+                walker.value(wire, kind, false)
+            })
+        }
+        _ => walker.value(wire, kind, false),
+    })?;
+    page.header = left - walker.left;
+    Ok(page)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A field's head and its value.
+    fn field(step: u8, wire: u8, value: &[u8]) -> Vec<u8> {
+        [&[step << 4 | wire], value].concat()
+    }
+
+    fn zigzag(v: i32) -> Vec<u8> {
+        let mut v = ((v << 1) ^ (v >> 31)).cast_unsigned();
+        let mut out = vec![];
+        while v >= 0x80 {
+            out.push(v as u8 | 0x80);
+            v >>= 7;
+        }
+        out.push(v as u8);
+        out
+    }
+
+    /// A footer whose schema has elements with these numbers of children.
+    fn footer_of(children: &[i32]) -> Vec<u8> {
+        let element = |n: &i32| [field(4, 8, &[1, b'a']), field(1, 5, &zigzag(*n)), vec![0]].concat();
+        let mut length = vec![0xfc];
+        let mut n = children.len();
+        while n >= 0x80 {
+            length.push(n as u8 | 0x80);
+            n >>= 7;
+        }
+        length.push(n as u8);
+        let list = [length, children.iter().flat_map(element).collect()].concat();
+        [field(1, 5, &[2]), field(1, 9, &list), vec![0]].concat()
+    }
+
+    #[test]
+    fn schemas_that_end_are_accepted() {
+        for children in [&[1, 0][..], &[3, 0, 2, 0, 0, 0], &[0]] {
+            footer(&footer_of(children)).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_schema_without_end_is_refused() {
+        let refusal = |children: &[i32]| footer(&footer_of(children)).unwrap_err();
+        assert_eq!(refusal(&[1, i32::MAX, 0]), "a group of 2147483647 columns in a schema of 3");
+        assert_eq!(refusal(&[-1]), "a group of -1 columns");
+        let deep: Vec<i32> = std::iter::repeat_n(1, 100_000).chain([0]).collect();
+        assert_eq!(refusal(&deep), "columns more than 40 levels deep");
+    }
+
+    #[test]
+    fn headers_that_end_early_or_lie_about_lengths_are_refused() {
+        let whole = footer_of(&[3, 0, 2, 0, 0, 0]);
+        for length in 0..whole.len() {
+            assert!(footer(&whole[..length]).is_err(), "{length}");
+        }
+        // A text of 2^40 bytes; a list of 2^40 entries; a field whose type is another's; one field twice.
+        let huge = [0x80, 0x80, 0x80, 0x80, 0x80, 0x20];
+        assert!(footer(&field(6, 8, &huge)).unwrap_err().contains("1099511627776 bytes"));
+        assert!(footer(&field(5, 9, &[&[0xfc][..], &huge].concat())).unwrap_err().contains("entries"));
+        assert!(footer(&field(3, 8, &[0])).unwrap_err().contains("type 8"));
+        let twice = [field(2, 9, &[0x0c]), field(0, 9, &[4, 0x0c])].concat();
+        assert_eq!(footer(&twice).unwrap_err(), "fields out of order");
+    }
+
+    #[test]
+    fn a_page_says_its_sizes() {
+        let data = [field(1, 5, &zigzag(7)), field(1, 5, &[0]), vec![0]].concat();
+        let header = [
+            field(1, 5, &[0]),
+            field(1, 5, &zigzag(100)),
+            field(1, 5, &zigzag(60)),
+            field(2, 12, &data),
+            vec![0],
+        ]
+        .concat();
+        let found = page(&header[..], 500).unwrap();
+        let header = header.len() as u64;
+        assert_eq!(found, Page { header, stored: 60, unpacked: 100, values: 7, dictionary: false });
+        assert!(page(&[0x15, 0, 0x15, 1][..], 500).unwrap_err().contains("a page of -1 bytes"));
+    }
+}

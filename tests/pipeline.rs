@@ -1,4 +1,5 @@
 use auto_e2h::core::{Direction, Kind, Origin, stream};
+use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
 use auto_e2h::learn::{Collected, Run, RunOptions};
 use std::path::Path;
@@ -89,4 +90,25 @@ fn without_a_hard_success_the_critic_is_skipped_and_without_rollouts_the_update(
     assert_eq!(same.weights().unwrap(), hard.weights().unwrap());
     let record = run.evaluate(2, &same, Some(&none)).unwrap();
     assert!(record.skipped);
+}
+
+#[test]
+fn all_rollouts_are_kept_as_a_dataset_when_asked_for() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options(&dir.path().join("run"));
+    options.set.extend(
+        ["loop.keep_rollouts=true", "train.easy_steps=2", "train.initial_steps=2"].map(str::to_owned),
+    );
+    let run = Run::open(&options).unwrap();
+    let base = run.demonstrations().unwrap();
+    let (easy, hard) = (run.train_easy(&base).unwrap(), run.train_initial(&base).unwrap());
+    let collected = run.collect(1, &hard, &easy).unwrap();
+    assert_eq!(collected.easy.len() + collected.rejected.len(), collected.easy_rollouts);
+
+    let kept = Dataset::open(run.path().join("iteration_01/rollouts")).unwrap();
+    assert_eq!(kept.len(), collected.hard.len() + collected.easy_rollouts);
+    assert_eq!(kept.read_episode(0).unwrap(), collected.hard[0], "each cycle begins with its hard rollout");
+    assert_eq!(kept.read_episode(1).unwrap().origin.direction, Direction::Easy);
+    // The second collection of a resumed run leaves the dataset as it is.
+    run.collect(1, &hard, &easy).unwrap();
 }

@@ -14,6 +14,8 @@ pub struct Collected {
     pub hard: Vec<Episode>,
     /// Easy rollouts that succeeded and began at the hard goal, so that their reversal ends there; in cycle order.
     pub easy: Vec<Episode>,
+    /// The other easy rollouts, in cycle order; none unless [`LoopConfig::keep_rollouts`].
+    pub rejected: Vec<Episode>,
     /// Easy rollouts started.
     pub easy_rollouts: usize,
     /// Easy rollouts that succeeded.
@@ -98,11 +100,12 @@ pub fn collect(
                 begin(lane, Direction::Easy)
             }
             Direction::Easy => {
-                if success {
-                    lane.state.collected.easy_successes += 1;
-                    if lane.state.at_goal {
-                        lane.state.collected.easy.push(episode);
-                    }
+                let collected = &mut lane.state.collected;
+                collected.easy_successes += usize::from(success);
+                if success && lane.state.at_goal {
+                    collected.easy.push(episode);
+                } else if config.keep_rollouts {
+                    collected.rejected.push(episode);
                 }
                 lane.state.cycles.pop_front();
                 if lane.state.cycles.is_empty() {
@@ -162,6 +165,7 @@ pub fn collect(
         let c = lane.state.collected;
         all.hard.extend(c.hard);
         all.easy.extend(c.easy);
+        all.rejected.extend(c.rejected);
         all.easy_rollouts += c.easy_rollouts;
         all.easy_successes += c.easy_successes;
         for (cause, n) in c.resets {
@@ -170,5 +174,6 @@ pub fn collect(
     }
     all.hard.sort_by_key(|e| e.origin.episode);
     all.easy.sort_by_key(|e| e.origin.episode);
+    all.rejected.sort_by_key(|e| e.origin.episode);
     Ok(all)
 }

@@ -119,6 +119,10 @@ pub struct LoopConfig {
     pub refine_demonstrations: bool,
     /// True: the easy policy learns from demonstrations that passed the kinematic filter.
     pub refine_easy_demonstrations: bool,
+    /// True keeps every rollout of the loop with its images, successes and failures of both policies, as a LeRobot dataset in
+    /// `iteration_NN/rollouts`. False keeps what is learned from. Checkpoints from before it have none.
+    #[serde(default)]
+    pub keep_rollouts: bool,
 }
 
 /// Training steps and how a step looks.

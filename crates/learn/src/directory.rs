@@ -6,6 +6,7 @@ use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use std::borrow::Borrow;
 use std::path::{Path, PathBuf};
 
 /// Layout version of a run directory; 2: episodes are LeRobot datasets.
@@ -175,7 +176,7 @@ impl Directory {
     pub(crate) fn put_episodes<T: Serialize>(
         &self,
         name: &str,
-        episodes: &[Episode],
+        episodes: &[impl Borrow<Episode>],
         notes: &T,
     ) -> Result<()> {
         let beside_name = format!("{name}.unfinished");
@@ -183,7 +184,8 @@ impl Directory {
         if beside.exists() {
             std::fs::remove_dir_all(&beside).map_err(io("removing", &beside))?;
         }
-        if let Some(first) = episodes.first() {
+        let mut episodes = episodes.iter().map(Borrow::borrow).peekable();
+        if let Some(first) = episodes.peek() {
             let mut writer = Writer::create(&beside, e2h_core::CONTROL_HZ, Some(ROBOT), features_of(first))?;
             for episode in episodes {
                 writer.push_episode(episode)?;

@@ -391,7 +391,7 @@ impl Run {
     /// Closed-loop collection with both policies.
     ///
     /// # Errors
-    /// When the simulation fails.
+    /// When the simulation fails, or rollouts are to be kept and cannot be written.
     pub fn collect(
         &self,
         iteration: u32,
@@ -399,7 +399,16 @@ impl Run {
         easy: &DiffusionPolicy,
     ) -> Result<Collected> {
         let c = &self.config().closed_loop;
-        collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)
+        let collected = collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)?;
+        let place = folder(iteration, "rollouts");
+        if c.keep_rollouts && !self.dir.join(&place).exists() {
+            let mut all: Vec<&Episode> =
+                collected.hard.iter().chain(&collected.easy).chain(&collected.rejected).collect();
+            // As they happened: of a cycle the hard rollout, then the easy one.
+            all.sort_by_key(|e| (e.origin.episode, e.origin.direction == Direction::Easy));
+            self.dir.put_episodes(&place, &all, &collected.resets)?;
+        }
+        Ok(collected)
     }
 
     /// Reverses and refines the easy rollouts of one iteration, with a critic trained on its hard rollouts.

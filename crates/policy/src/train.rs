@@ -94,9 +94,21 @@ impl Trainer {
                 train.conditions, train.noises
             )));
         }
+        if !(train.keypoint_sharpness.is_finite() && train.keypoint_sharpness > 0.0) {
+            return Err(Error::Config(format!(
+                "keypoint_sharpness: expected more than 0, got {}",
+                train.keypoint_sharpness
+            )));
+        }
         let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
         if let Some(weights) = start {
             model.params.import(weights)?;
+        } else if train.keypoint_sharpness > 1.0 || train.keypoint_sharpness < 1.0 {
+            let mut weights = model.params.export()?;
+            for (_, attention) in weights.iter_mut().filter(|(name, _)| name.ends_with("pool.nets.weight")) {
+                attention.data.iter_mut().for_each(|w| *w *= train.keypoint_sharpness);
+            }
+            model.params.import(&weights)?;
         }
         let adam = Adam::new(&train.optimiser(), &model.params)?;
         let ema = Ema::new(&train.ema, &model.params)?;

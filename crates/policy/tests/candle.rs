@@ -66,6 +66,7 @@ fn train_config() -> TrainConfig {
         noises: 2,
         conditioning_dropout: 0.2,
         observation_noise: 0.05,
+        keypoint_sharpness: 1.0,
         adam: e2h_nn::AdamConfig { clip_norm: Some(1.0), ..Default::default() },
         schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 1e-3, warmup: 2 },
         ema: e2h_nn::EmaConfig::default(),

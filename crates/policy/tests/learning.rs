@@ -34,6 +34,7 @@ fn train_config() -> TrainConfig {
         noises: 2,
         conditioning_dropout: 0.0,
         observation_noise: 0.0,
+        keypoint_sharpness: 1.0,
         adam: e2h_nn::AdamConfig { clip_norm: Some(1.0), ..Default::default() },
         schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 2e-3, warmup: 10 },
         ema: e2h_nn::EmaConfig::default(),
@@ -72,6 +73,25 @@ fn one_trajectory_is_overfitted_and_the_sampled_actions_are_its_own() {
         }
         assert_eq!(action[7] > 0.5, want[7] > 0.5, "gripper of action {k}: {}", action[7]);
     }
+}
+
+#[test]
+fn sharper_keypoints_start_from_the_same_draw() {
+    let config = PolicyConfig::tiny();
+    let weights = |keypoint_sharpness: f32| {
+        let train = TrainConfig { keypoint_sharpness, ..train_config() };
+        Trainer::new(&config, &train, 10, None, 1, "sharp").map(|t| t.weights().unwrap())
+    };
+    let (plain, sharp) = (weights(1.0).unwrap(), weights(4.0).unwrap());
+    let mut attention = 0;
+    for (name, before) in &plain {
+        let factor = if name.ends_with("pool.nets.weight") { 4.0 } else { 1.0 };
+        attention += usize::from(factor > 1.0);
+        let after = &sharp[name].data;
+        assert!(before.data.iter().zip(after).all(|(b, a)| (b * factor - a).abs() < 1e-6), "{name}");
+    }
+    assert_eq!(attention, config.cameras.len());
+    assert!(matches!(weights(0.0), Err(Error::Config(_))));
 }
 
 #[test]

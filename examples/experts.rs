@@ -88,7 +88,9 @@ fn main() -> Result<()> {
     };
     let n = arguments.trials;
     if !arguments.json {
-        println!("of {n} trials, hard/easy     experts  replay   starts  still  random  deepest contact  steps/s");
+        println!(
+            "of {n} trials, hard/easy     experts  replay   starts  still  random  deepest contact  steps/s"
+        );
     }
     for name in &names {
         let (c, speed) = measure(name, &arguments)?;

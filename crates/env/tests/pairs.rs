@@ -3,8 +3,8 @@
 
 use e2h_core::{Action, Direction, Origin, Outcome, Pose, Rng, stream};
 use e2h_env::{
-    Blind, DemonstratorConfig, Env, EnvConfig, Error, Task, TaskOptions, demonstrate, probe, registry, replay,
-    task, variants,
+    Blind, DemonstratorConfig, Env, EnvConfig, Error, Task, TaskOptions, demonstrate, probe, registry,
+    replay, task, variants,
 };
 use e2h_refine::{ReverseConfig, reverse};
 use nalgebra::Vector3;
@@ -205,7 +205,8 @@ fn reversed_easy_demonstrations_replay_in_the_hard_task() {
 
 #[test]
 fn policies_that_do_not_look_fail_and_break_nothing() {
-    let policies = [Blind::Still, Blind::Random { hold: 1 }, Blind::Random { hold: 1 }, Blind::Random { hold: 20 }];
+    let policies =
+        [Blind::Still, Blind::Random { hold: 1 }, Blind::Random { hold: 1 }, Blind::Random { hold: 20 }];
     each(|task, env| {
         for direction in BOTH {
             for (trial, policy) in policies.into_iter().enumerate() {
@@ -215,7 +216,11 @@ fn policies_that_do_not_look_fail_and_break_nothing() {
                 assert!(probed.deepest < 1e-3, "{name}: a contact is {:.2} mm deep", probed.deepest * 1e3);
                 let ends = [Outcome::Timeout, Outcome::Dropped];
                 assert!(ends.contains(&probed.outcome), "{name}: {:?}", probed.outcome);
-                assert!(policy != Blind::Still || probed.outcome == Outcome::Timeout, "{name}: {:?}", probed.outcome);
+                assert!(
+                    policy != Blind::Still || probed.outcome == Outcome::Timeout,
+                    "{name}: {:?}",
+                    probed.outcome
+                );
             }
         }
     });

@@ -94,7 +94,9 @@ impl Task for CubeStack {
         sim.set_body("base", &base)?;
         let position = match direction {
             Direction::Hard => START.draw(rng, HALF),
-            Direction::Easy => base.position + near_middle(rng, OFF_MIDDLE) + Vector3::new(0.0, 0.0, 2.0 * HALF),
+            Direction::Easy => {
+                base.position + near_middle(rng, OFF_MIDDLE) + Vector3::new(0.0, 0.0, 2.0 * HALF)
+            }
         };
         sim.set_object(&Pose::new(position, turn(draw(rng, [-FRAC_PI_4, FRAC_PI_4]))))
     }

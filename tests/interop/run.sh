@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Do LeRobot and this project open, compare and extend each other's datasets, and open each other's policies? Opt-in: it needs Python 3.10 to 3.12 and some
-# gigabytes of packages, which go into a virtual environment of its own (E2H_INTEROP_ENV, by default below target/).
+# Do LeRobot and this project open, compare and extend each other's datasets, and open each other's policies? It needs Python
+# 3.10 to 3.12 and six gigabytes of packages, which go into a virtual environment of its own (E2H_INTEROP_ENV, by default
+# below target/), once.
 # Exit status: 0 everything holds, 1 something does not, 3 the packages could not be installed and nothing was run.
 set -euo pipefail
 here="$(cd "$(dirname "$0")" && pwd)"
@@ -8,16 +9,19 @@ root="$(cd "$here/../.." && pwd)"
 environment="${E2H_INTEROP_ENV:-$root/target/interop/environment}"
 python="$environment/bin/python"
 
-if ! "$python" -c 'import lerobot' 2> /dev/null; then
+# An environment is whole when it says what was installed; one that was cut off, or is of other versions, is made anew.
+if ! cmp --silent "$here/requirements.txt" "$environment/installed.txt"; then
     echo "installing LeRobot into $environment"
-    if ! { python3 -m venv "$environment" && "$python" -m pip install --quiet -r "$here/requirements.txt"; }; then
-        echo "NOT RUN: the packages of tests/interop/requirements.txt could not be installed"
+    rm -rf "$environment"
+    if ! why="$({ python3 -m venv "$environment" && "$python" -m pip install --quiet -r "$here/requirements.txt"; } 2>&1)"; then
+        echo "NOT RUN: LeRobot's packages could not be installed: $(grep -v '^$\|notice' <<< "$why" | tail -n 1)"
         exit 3
     fi
+    cp "$here/requirements.txt" "$environment/installed.txt"
 fi
 
 cd "$root"
-cargo build --release --quiet --example interop --example dataset --example refine --example lerobot_actions --example export
+cargo build --release --quiet --locked --example interop --example dataset --example refine --example lerobot_actions --example export
 programs="${CARGO_TARGET_DIR:-$root/target}/release/examples"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT

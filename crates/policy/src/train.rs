@@ -103,7 +103,7 @@ impl Trainer {
         let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
         if let Some(weights) = start {
             model.params.import(weights)?;
-        } else if train.keypoint_sharpness > 1.0 || train.keypoint_sharpness < 1.0 {
+        } else if (train.keypoint_sharpness - 1.0).abs() > 0.0 {
             let mut weights = model.params.export()?;
             for (_, attention) in weights.iter_mut().filter(|(name, _)| name.ends_with("pool.nets.weight")) {
                 attention.data.iter_mut().for_each(|w| *w *= train.keypoint_sharpness);

@@ -65,6 +65,10 @@ pub(super) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, wha
     if reader.info().raw_bytes() > bytes.len().saturating_mul(DENSEST).saturating_add(SMALL) {
         return Err(bad(format!("{} bytes, too few for it", bytes.len())));
     }
+    // The decoder cuts a palette into colours without a look at its length, and panics.
+    if let Some(palette) = reader.info().palette.as_ref().filter(|p| p.len() % 3 != 0 || p.len() > 256 * 3) {
+        return Err(bad(format!("a palette of {} bytes, which is not up to 256 colours", palette.len())));
+    }
     let size = reader.output_buffer_size().ok_or_else(|| bad("more pixels than memory".to_owned()))?;
     let mut data = vec![0; size];
     let frame = reader.next_frame(&mut data).map_err(broken)?;
@@ -115,6 +119,26 @@ mod tests {
             writer.write_image_data(&data).unwrap();
             writer.finish().unwrap();
             assert_eq!(from(&bytes, 1, 2).unwrap(), [7, 7, 7, 9, 9, 9], "{kind:?} {depth:?}");
+        }
+    }
+
+    #[test]
+    fn a_palette_that_is_not_of_whole_colours_is_refused() {
+        let indexed = |palette: &[u8]| {
+            let mut bytes = vec![];
+            let mut encoder = png::Encoder::new(&mut bytes, 2, 1);
+            encoder.set_color(png::ColorType::Indexed);
+            encoder.set_depth(png::BitDepth::Eight);
+            encoder.set_palette(palette.to_vec());
+            let mut writer = encoder.write_header().unwrap();
+            writer.write_image_data(&[0, 1]).unwrap();
+            writer.finish().unwrap();
+            bytes
+        };
+        assert_eq!(from(&indexed(&[1, 2, 3, 4, 5, 6]), 1, 2).unwrap(), [1, 2, 3, 4, 5, 6]);
+        for palette in [&[7; 5][..], &[7; 7], &[7; 257 * 3]] {
+            let message = from(&indexed(palette), 1, 2).unwrap_err().to_string();
+            assert!(message.starts_with("x: row 0: expected a PNG image of 1 x 2"), "{message}");
         }
     }
 

@@ -290,6 +290,63 @@ proptest! {
     }
 }
 
+/// What LeRobot 0.4.4 wrote by the formula of `tests/golden/make_lerobot_dataset.py`, copied to where it may be changed.
+fn of_lerobot(root: &Path) {
+    fn copy(from: &Path, to: &Path) {
+        std::fs::create_dir_all(to).unwrap();
+        for entry in std::fs::read_dir(from).unwrap().flatten() {
+            let (from, to) = (entry.path(), to.join(entry.file_name()));
+            if from.is_dir() {
+                copy(&from, &to);
+            } else {
+                std::fs::copy(from, to).unwrap();
+            }
+        }
+    }
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/lerobot/dataset"), root);
+}
+
+#[test]
+fn a_dataset_that_lerobot_wrote_is_read_number_by_number_and_goes_on() {
+    let (_folder, root) = place();
+    of_lerobot(&root);
+    let report = check(&root).unwrap();
+    assert_eq!(report.faults, []);
+    assert_eq!((report.whole, report.frames, report.unverified_files), (2, 9, 2));
+    let dataset = Dataset::open(&root).unwrap();
+    for (e, rows) in [(0, 5), (1, 4)] {
+        let table = dataset.read(e).unwrap();
+        let number = |t: usize, i: usize| e as f64 + t as f64 / 8.0 + i as f64 / 64.0;
+        let all = |n: usize| (0..rows * n).map(|i| number(i / n, i % n)).collect::<Vec<_>>();
+        for (name, n) in
+            [("observation.tcp", 7), ("observation.jaw_mm", 1), ("observation.force", 6), ("action", 3)]
+        {
+            assert_eq!(table.column(name).unwrap().numbers().unwrap(), all(n), "{name}");
+        }
+        let flags: Vec<bool> = (0..rows).map(|t| t % 2 == 1).collect();
+        assert_eq!(table.bool("touching").unwrap(), flags);
+        let ticks: Vec<i64> = (0..rows).map(|t| (1000 * e + t) as i64).collect();
+        assert_eq!(table.i64("ticks").unwrap(), ticks);
+        let Some(Column::Text(notes)) = table.column("note") else { panic!("no notes") };
+        assert_eq!((notes[0].as_str(), notes[1].as_str()), ("first", ""));
+        for (t, file) in table.png("observation.images.front").unwrap().iter().enumerate() {
+            assert_eq!(decode_png(file, 6, 8, "it").unwrap().data, [(16 * e + t) as u8; 6 * 8 * 3]);
+        }
+        assert_eq!(dataset.row_tasks(e).unwrap(), vec![["unplug", "plug it in"][e]; rows]);
+    }
+    let message = dataset.read_episode(0).unwrap_err().to_string();
+    assert!(message.contains("file-000.parquet: episode 0, column `source."), "{message}");
+
+    let own: Vec<String> = dataset.info().own_features().into_iter().map(|(n, _)| n).collect();
+    let own: Vec<&str> = own.iter().map(String::as_str).collect();
+    let mut writer = Writer::append(&root).unwrap();
+    writer.push(&dataset.read_columns(1, &own).unwrap(), "plug it in").unwrap();
+    writer.finish().unwrap();
+    assert_eq!(check(&root).unwrap().faults, []);
+    let read = |e| Dataset::open(&root).unwrap().read_columns(e, &own).unwrap();
+    assert_eq!(read(1), read(2));
+}
+
 fn faults(root: &Path) -> Vec<String> {
     check(root).unwrap().faults.into_iter().map(|f| f.message).collect()
 }

@@ -67,6 +67,26 @@ fn a_run_directory_is_never_overwritten() {
 }
 
 #[test]
+fn videos_without_a_decoder_are_refused_by_name_and_the_rest_is_shown() {
+    let dir = tempfile::tempdir().unwrap();
+    let page = dir.path().join("page.html");
+    let output = example("view")
+        .arg("tests/golden/lerobot/video")
+        .arg("--out")
+        .arg(&page)
+        .env("E2H_FFMPEG", "/no/such/ffmpeg")
+        .output()
+        .unwrap();
+    assert_success(&output);
+    let said = text(&output.stdout) + &text(&output.stderr);
+    for word in ["observation.images.front", "file-000.mp4", "E2H_FFMPEG", "/no/such/ffmpeg"] {
+        assert!(said.contains(word), "expected `{word}` in: {said}");
+    }
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.contains("episode 1") && html.contains("plug it in"));
+}
+
+#[test]
 fn a_loss_that_is_no_number_stops_the_run_with_step_and_seed() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("run");

@@ -248,6 +248,36 @@ fn a_dataset_with_hostile_names_is_harmless() {
 }
 
 #[test]
+fn datasets_of_other_robots_are_shown_whole() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("page.html");
+    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/lerobot/dataset");
+    let written = write(&golden, &out, &Options::default()).unwrap();
+    let html = std::fs::read_to_string(&out).unwrap();
+    assert_eq!((entries(&assert_self_contained(&html)), written.shown), (2, 2));
+    for text in ["other_arm", "plug it in", "unplug", "4 of 4 frames"] {
+        assert!(html.contains(text), "{text}");
+    }
+    // Text of a row, the names of entries, and the places of a matrix that has no names.
+    assert!(
+        html.contains("<dd><bdi>first</bdi></dd>") && html.contains("pan") && html.contains("1,2"),
+        "columns"
+    );
+
+    // A map of heights is drawn as its least, mean and largest entry, not as 200 lines.
+    let root = dir.path().join("map");
+    let shape = Feature { shape: vec![10, 20], ..Feature::scalar(Dtype::Float32) };
+    let mut writer = Writer::create(&root, 10.0, None, vec![("heights".to_owned(), shape)]).unwrap();
+    let columns = vec![("heights".to_owned(), Column::F32((0..600).map(|v| v as f32).collect()))];
+    writer.push(&Table { rows: 3, columns }, "look").unwrap();
+    writer.finish().unwrap();
+    write(&root, &out, &Options::default()).unwrap();
+    let html = std::fs::read_to_string(&out).unwrap();
+    assert!(html.contains("heights, 10 x 20") && html.contains("largest"), "a summary");
+    assert!(!html.contains("9,19"), "one line an entry");
+}
+
+#[test]
 fn a_page_stays_below_its_size_and_says_what_is_missing() {
     let dir = tempfile::tempdir().unwrap();
     let (root, out) = (dir.path().join("data"), dir.path().join("page.html"));

@@ -32,7 +32,7 @@ pub(crate) fn read(
     }
     // Half a frame early, so that rounding of times does not skip the first frame.
     let start = (from - 0.5 / fps).max(0.0);
-    let program = std::env::var_os(PROGRAM).unwrap_or_else(|| "ffmpeg".into());
+    let program = std::env::var_os(PROGRAM).filter(|p| !p.is_empty()).unwrap_or_else(|| "ffmpeg".into());
     let mut command = Command::new(&program);
     command.args(["-v", "error", "-nostdin", "-ss", &format!("{start:.6}")]);
     // The file is what its name says: ffmpeg goes by the content, and what it takes for a playlist may name other files of

@@ -6,12 +6,16 @@ use super::{Listed, Options};
 use crate::directory::io;
 use crate::{Error, Result};
 use e2h_core::{Kind, Outcome};
-use e2h_data::lerobot::{Column, ColumnSlice, DEFAULT_FEATURES, Dataset, Dtype, Feature, Table};
+use e2h_data::lerobot::{Column, ColumnSlice, DEFAULT_FEATURES, Dataset, Feature, Table};
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// What the `refine` example leaves beside its dataset: the fate of every frame of every recording.
 const FRAMES: &str = "report/frames.csv";
+/// Entries of a column that are drawn one by one; of others the least, the mean and the largest.
+const WIDEST: usize = 64;
+/// Different texts of a column that are shown.
+const TEXTS: usize = 4;
 /// What names of a tool's coordinates begin with, in the order they are looked for.
 const TOOLS: [&str; 6] = ["eef_", "ee_", "tcp_", "ee.", "tcp.", ""];
 
@@ -46,9 +50,11 @@ impl DatasetSource {
     /// An episode, with its pictures or without.
     pub(super) fn read(&self, index: usize, pictures: bool) -> Result<Recording> {
         let info = self.dataset.info();
-        let numeric = |f: &Feature| !f.is_visual() && f.dtype != Dtype::String;
+        let own =
+            |name: &str| !DEFAULT_FEATURES.iter().any(|(n, _)| *n == name) && !name.starts_with("source.");
+        let small = |f: &Feature| !f.is_visual() && f.width() <= WIDEST;
         let names: Vec<&str> =
-            info.features.iter().filter(|(_, f)| numeric(f)).map(|(n, _)| n.as_str()).collect();
+            info.features.iter().filter(|(_, f)| small(f)).map(|(n, _)| n.as_str()).collect();
         let table = self.dataset.read_columns(index, &names)?;
         let mut recording = Recording {
             name: self.listed[index].name.clone(),
@@ -57,12 +63,16 @@ impl DatasetSource {
             hz: info.fps,
             ..Recording::default()
         };
-        for (name, feature) in info.features.iter().filter(|(_, f)| numeric(f)) {
-            let default = DEFAULT_FEATURES.iter().any(|(n, _)| n == name);
-            let Some(values) = table.column(name).and_then(Column::numbers) else { continue };
-            if default || name.starts_with("source.") {
+        for (name, feature) in info.features.iter().filter(|(n, f)| own(n) && !f.is_visual()) {
+            if let Some(Column::Text(texts)) = table.column(name) {
+                recording.facts.push((name.clone(), several(texts)));
                 continue;
             }
+            if !small(feature) {
+                recording.columns.push(self.summary(index, name, feature)?);
+                continue;
+            }
+            let Some(values) = table.column(name).and_then(Column::numbers) else { continue };
             if feature.width() == 1 && (name == "value" || name.ends_with(".value")) {
                 recording.value = Some(values);
             } else if feature.width() == 1 && values.iter().all(|v| Some(v) == values.first()) {
@@ -88,6 +98,26 @@ impl DatasetSource {
             self.cameras(index, &mut recording);
         }
         Ok(recording)
+    }
+
+    /// A column of more entries than anybody tells apart, a map or a grid, by its least, mean and largest one.
+    fn summary(&self, index: usize, name: &str, feature: &Feature) -> Result<Series> {
+        // By itself: one such column of a long episode may be most of the memory.
+        let table = self.dataset.read_columns(index, &[name])?;
+        let values = table.column(name).and_then(Column::numbers).unwrap_or_default();
+        let of_row = |row: &[f64]| {
+            let mean = row.iter().sum::<f64>() / row.len().max(1) as f64;
+            [
+                row.iter().copied().fold(f64::INFINITY, f64::min),
+                mean,
+                row.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+            ]
+        };
+        Ok(Series {
+            name: format!("{name}, {}", shape(feature)),
+            entries: ["least", "mean", "largest"].map(str::to_owned).to_vec(),
+            values: values.chunks_exact(feature.width()).flat_map(of_row).collect(),
+        })
     }
 
     /// What `source.*`, `next.success` and the report beside the dataset say.
@@ -176,9 +206,8 @@ impl DatasetSource {
         }
         facts.push(("tasks".to_owned(), text));
         for (name, feature) in info.own_features() {
-            let shape: Vec<String> = feature.shape.iter().map(ToString::to_string).collect();
             let dtype = format!("{:?}", feature.dtype).to_lowercase();
-            facts.push((name, format!("{dtype}, {}", shape.join(" x "))));
+            facts.push((name, format!("{dtype}, {}", shape(&feature))));
         }
         let kept: usize = self.accounts.values().flat_map(|a| &a.fates).filter(|f| *f == "kept").count();
         let of: usize = self.accounts.values().map(|a| a.fates.len()).sum();
@@ -195,6 +224,28 @@ impl DatasetSource {
     }
 }
 
+/// Its sizes, for people.
+fn shape(feature: &Feature) -> String {
+    feature.shape.iter().map(ToString::to_string).collect::<Vec<_>>().join(" x ")
+}
+
+/// The different ones of some texts, in the order in which they come.
+fn several(texts: &[String]) -> String {
+    let mut seen: Vec<&String> = vec![];
+    for text in texts.iter().filter(|t| !t.is_empty()) {
+        if !seen.contains(&text) {
+            seen.push(text);
+        }
+        if seen.len() > TEXTS {
+            break;
+        }
+    }
+    let more = if seen.len() > TEXTS { "; and others" } else { "" };
+    seen.truncate(TEXTS);
+    let some: Vec<String> = seen.into_iter().map(|t| e2h_core::one_line(t)).collect();
+    format!("{}{more}", some.join("; "))
+}
+
 /// Names of the entries of a column; numbers where the dataset has none.
 fn entries(name: &str, feature: &Feature) -> Vec<String> {
     let width = feature.width();
@@ -208,8 +259,20 @@ fn entries(name: &str, feature: &Feature) -> Vec<String> {
     match plain.or_else(nested) {
         Some(names) if names.len() == width => names,
         _ if width == 1 => vec![name.to_owned()],
-        _ => (0..width).map(|i| i.to_string()).collect(),
+        _ => (0..width).map(|i| place(i, &feature.shape)).collect(),
     }
+}
+
+/// Where entry `i` stands in its row's shape: `2`, or `0,2` in a matrix.
+fn place(i: usize, shape: &[usize]) -> String {
+    let mut left = i;
+    let mut at: Vec<String> = vec![];
+    for size in shape.iter().rev() {
+        at.push((left % size).to_string());
+        left /= size;
+    }
+    at.reverse();
+    at.join(",")
 }
 
 fn given(slice: &ColumnSlice, dataset: &Dataset) -> Result<Position> {

@@ -338,8 +338,10 @@ fn everything_of_lerobots_that_is_not_computed_here_is_listed() {
 
     let message = edit("policy_preprocessor.json", &|v| v["steps"][0]["registry_name"] = "tokenizer".into());
     assert!(message.contains("steps") && message.contains("tokenizer"), "{message}");
-    let message = edit("policy_preprocessor.json", &|v| v["steps"][3]["state_file"] = "../x".into());
-    assert!(message.contains("in this folder"), "{message}");
+    for file in ["../x", "a\u{7f}\n.safetensors"] {
+        let message = edit("policy_preprocessor.json", &|v| v["steps"][3]["state_file"] = file.into());
+        assert!(message.contains("in this folder") && !message.contains(char::is_control), "{message:?}");
+    }
     let message = edit("policy_preprocessor.json", &|v| {
         v["steps"][3]["config"]["norm_map"]["STATE"] = "QUANTILES".into();
     });

@@ -145,7 +145,8 @@ impl Statistics {
         };
         let file =
             step.state_file.ok_or_else(|| fail(format!("{wanted}: expected a state_file, found none")))?;
-        if Path::new(&file).components().count() != 1 || Path::new(&file).file_name().is_none() {
+        let inside = Path::new(&file).components().count() == 1 && Path::new(&file).file_name().is_some();
+        if !inside || file.contains(char::is_control) {
             return Err(fail(format!("{wanted}: expected a state_file in this folder, found `{file}`")));
         }
         let step = serde_json::from_value(step.config).map_err(|e| fail(format!("{wanted}: {e}")))?;

@@ -3,7 +3,10 @@
 //!
 //!     cargo run --release --example experts -- --all --trials 100
 //!
-//! About a minute a pair on two cores. `--json` prints one line a variant and nothing else.
+//! Successes, hard and easy: `experts`; `replay` of reversed easy demonstrations; `starts` in which both predicates are as they should
+//! be; policies that hold `still` or draw `random` goal poses. Then the deepest contact of anything with anything while goals are
+//! drawn every step (trembling) and every 20 steps (sweeping, with all the force that the arm has), and control steps a second
+//! with both cameras. About a minute a pair on two cores. `--json` prints one line a variant and nothing else.
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::Result;
@@ -40,7 +43,7 @@ struct Arguments {
 }
 
 const BOTH: [Direction; 2] = [Direction::Hard, Direction::Easy];
-/// Control steps for which a random goal is kept: half of the trials tremble, half sweep.
+/// Control steps for which a random goal is kept: half of the trials tremble, half sweep with all the force that the arm has.
 const HOLDS: [usize; 2] = [1, 20];
 /// Side of the images for which the speed is measured, pixels, and the control steps.
 const SPEED: (usize, usize) = (72, 400);
@@ -56,8 +59,8 @@ struct Count {
     random: [u32; 2],
     diverged: u32,
     through_table: u32,
-    /// Of blind policies, m.
-    deepest: f64,
+    /// Under trembling (and still) and under sweeping policies, m.
+    deepest: [f64; 2],
     rows: [usize; 2],
 }
 
@@ -69,11 +72,11 @@ impl Count {
             self.still[d] += other.still[d];
             self.random[d] += other.random[d];
             self.rows[d] += other.rows[d];
+            self.deepest[d] = self.deepest[d].max(other.deepest[d]);
         }
         self.replay += other.replay;
         self.diverged += other.diverged;
         self.through_table += other.through_table;
-        self.deepest = self.deepest.max(other.deepest);
     }
 }
 
@@ -89,7 +92,7 @@ fn main() -> Result<()> {
     let n = arguments.trials;
     if !arguments.json {
         println!(
-            "of {n} trials, hard/easy     experts  replay   starts  still  random  deepest contact  steps/s"
+            "of {n} trials, hard/easy     experts  replay   starts  still  random  trembling/sweeping, mm  steps/s"
         );
     }
     for name in &names {
@@ -101,7 +104,7 @@ fn main() -> Result<()> {
                 "hard_starts": c.starts[0], "easy_starts": c.starts[1],
                 "still_hard": c.still[0], "still_easy": c.still[1],
                 "random_hard": c.random[0], "random_easy": c.random[1],
-                "deepest_contact_mm": (c.deepest * 1e5).round() / 100.0,
+                "deepest_contact_mm": c.deepest.map(|m| (m * 1e5).round() / 100.0),
                 "diverged": c.diverged, "through_table": c.through_table,
                 "steps_per_second": speed.round(), "image_size": SPEED.0,
                 "mean_rows_hard": c.rows[0] / n.max(1) as usize, "mean_rows_easy": c.rows[1] / n.max(1) as usize,
@@ -110,13 +113,14 @@ fn main() -> Result<()> {
         } else {
             let two = |[hard, easy]: [u32; 2]| format!("{hard}/{easy}");
             println!(
-                "{name:<26} {:>9} {:>7} {:>8} {:>6} {:>7} {:>13.2} mm {speed:>8.0}",
+                "{name:<26} {:>9} {:>7} {:>8} {:>6} {:>7} {:>12.2}/{:<8.2} {speed:>10.0}",
                 two(c.experts),
                 c.replay,
                 two(c.starts),
                 two(c.still),
                 two(c.random),
-                c.deepest * 1e3,
+                c.deepest[0] * 1e3,
+                c.deepest[1] * 1e3,
             );
             if c.diverged + c.through_table > 0 {
                 println!("{:<26} {} diverged, {} fell through the table", "", c.diverged, c.through_table);
@@ -190,7 +194,8 @@ fn run(env: &mut Env, trials: impl Iterator<Item = u32>, seed: u64) -> Result<Co
                 }
                 count.diverged += u32::from(probed.outcome == Outcome::Diverged);
                 count.through_table += u32::from(probed.through_table);
-                count.deepest = count.deepest.max(probed.deepest);
+                let sweeps = usize::from(policy == Blind::Random { hold: HOLDS[1] });
+                count.deepest[sweeps] = count.deepest[sweeps].max(probed.deepest);
             }
         }
     }

@@ -21,7 +21,7 @@ impl Mlp {
     /// A network through the sizes `dims`, the input's first, that drops hidden numbers with probability `dropout`.
     ///
     /// # Errors
-    /// [`Error::Config`] with fewer than two sizes, a size of zero, or a probability outside [0, 1).
+    /// [`Error::Config`] with fewer than two sizes, a size of zero or above 2^30, or a probability outside [0, 1).
     pub fn new(dims: &[usize], dropout: f32, builder: &Builder<'_>) -> Result<Self> {
         if dims.len() < 2 || dims.iter().any(|d| *d > WIDEST) {
             let found = format!("{dims:?}");

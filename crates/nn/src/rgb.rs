@@ -21,7 +21,7 @@ pub struct RgbEncoderConfig {
     /// Channels of the first stage, a multiple of 16. ResNet-18: 64.
     pub base_width: usize,
     /// Residual blocks of each stage; every stage after the first halves the map and doubles the channels. ResNet-18:
-    /// [2, 2, 2, 2]. Fewer stages keep a finer map for small images.
+    /// [2, 2, 2, 2]. Fewer stages keep a finer map for small images; more than 8 are refused.
     pub stage_blocks: Vec<usize>,
     /// Keypoints of the spatial softmax. LeRobot: 32.
     pub keypoints: usize,

@@ -33,7 +33,8 @@ const CONDITION: usize = 1 << 30;
 
 impl UnetConfig {
     /// # Errors
-    /// [`Error::Config`] names the first setting that does not work.
+    /// [`Error::Config`] names the first setting that does not work: more than 16 levels, a kernel beyond 1023, a width beyond
+    /// 2^20 and a condition beyond 2^30 do not either.
     pub fn validate(&self) -> Result<()> {
         let fail = |what, expected, found: String| Err(Error::Config { what, expected, found });
         if self.input_dim == 0 || self.input_dim > WIDEST {

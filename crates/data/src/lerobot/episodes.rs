@@ -230,14 +230,17 @@ pub(crate) fn read_stats(path: &Path, features: &Features, rows: usize) -> Resul
     let file = ParquetFile::open(path)?;
     let features = features.iter().filter(|(_, f)| f.dtype != Dtype::String);
     let keys = || ["min", "max", "mean", "std"].into_iter().chain(QUANTILES.map(|q| q.0)).chain(["count"]);
-    let names: Vec<String> =
-        features.clone().flat_map(|(name, _)| keys().map(move |key| format!("stats/{name}/{key}"))).collect();
+    let width = |f: &Feature| if f.is_visual() { 3 } else { f.shape.last().copied().unwrap_or(1) };
+    let names: Vec<(String, usize)> = features
+        .clone()
+        .flat_map(|(name, f)| keys().map(move |key| (format!("stats/{name}/{key}"), width(f))))
+        .collect();
     // All columns at once: each pass over a file looks at all of them, whichever it reads.
     let mut lists = numbers(&file, &names, rows)?.into_iter();
     let mut out: Vec<Stats> = vec![vec![]; rows];
     for (name, feature) in features {
         let mut lists: Vec<Vec<Vec<f64>>> = lists.by_ref().take(keys().count()).collect();
-        let width = if feature.is_visual() { 3 } else { feature.shape.last().copied().unwrap_or(1) };
+        let width = width(feature);
         for (row, stats) in out.iter_mut().enumerate() {
             let mut found: Vec<Vec<f64>> =
                 lists.iter_mut().map(|l| l.get_mut(row).map(std::mem::take).unwrap_or_default()).collect();
@@ -265,15 +268,15 @@ pub(crate) fn read_stats(path: &Path, features: &Features, rows: usize) -> Resul
     Ok(out)
 }
 
-/// Every row's numbers of some columns, however deep its lists are.
+/// Every row's numbers of some columns, however deep its lists are; of each column also how many there may be in a row.
 ///
 /// # Shapes
 /// (columns, rows, numbers)
-fn numbers(file: &ParquetFile, columns: &[String], rows: usize) -> Result<Vec<Vec<Vec<f64>>>> {
-    let names: Vec<&str> = columns.iter().map(String::as_str).collect();
+fn numbers(file: &ParquetFile, columns: &[(String, usize)], rows: usize) -> Result<Vec<Vec<Vec<f64>>>> {
+    let names: Vec<&str> = columns.iter().map(|(name, _)| name.as_str()).collect();
     let mut out = vec![vec![]; columns.len()];
     file.batches(&names, 0..rows, &mut |batch, first| {
-        for (column, out) in columns.iter().zip(&mut out) {
+        for ((column, most), out) in columns.iter().zip(&mut out) {
             let bad = |row: usize, found: String| {
                 file_error(&file.path, &format!("column `{column}`, row {row}"), "numbers", found)
             };
@@ -285,6 +288,10 @@ fn numbers(file: &ParquetFile, columns: &[String], rows: usize) -> Result<Vec<Ve
                     let list = value.as_list::<i32>();
                     let (start, end) = (list.value_offsets()[0], list.value_offsets()[list.len()]);
                     value = list.values().slice(start as usize, (end - start) as usize);
+                }
+                // Before they are kept: all columns of all rows are, for a while.
+                if value.len() > *most {
+                    return Err(bad(first + row, format!("{}, more than {most}", value.len())));
                 }
                 out.push(match value.data_type() {
                     DataType::Float64 => {

@@ -21,7 +21,7 @@ use parquet::arrow::arrow_reader::{
     ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReaderBuilder,
 };
 use parquet::arrow::{ArrowWriter, ProjectionMask};
-use parquet::basic::Compression;
+use parquet::basic::{Compression, Type};
 use parquet::errors::ParquetError;
 use parquet::file::metadata::{KeyValue, ParquetMetaDataReader};
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
@@ -50,6 +50,21 @@ const VALUES: (u64, u64) = (1 << 24, 1024);
 const BYTES: (u64, u64) = (1 << 28, 1024);
 /// Snappy makes at most 64 bytes of 3.
 const SNAPPY: u64 = 22;
+
+/// What the pages of one pass over a file unpack to, as far as their headers tell.
+#[derive(Default)]
+struct Promised {
+    values: u64,
+    /// Of texts and images.
+    bytes: u64,
+}
+
+impl Promised {
+    fn add(&mut self, values: u64, bytes: u64) {
+        self.values = self.values.saturating_add(values);
+        self.bytes = self.bytes.saturating_add(bytes);
+    }
+}
 
 /// One part of a file that is checked on its own: its bytes and their SHA-256.
 type Checksum = (u64, u64, String);
@@ -170,8 +185,14 @@ impl ParquetFile {
         format!("at most {} {what} of a file of {} bytes", self.most(limit), self.source.length)
     }
 
-    /// Looks at the headers of the pages of some columns of a row group, before they are decoded.
-    fn look(&self, group: usize, columns: &ProjectionMask) -> std::result::Result<(), String> {
+    /// Looks at the headers of the pages of some columns of a row group, before they are decoded. `promised` is what the groups
+    /// before it promised.
+    fn look(
+        &self,
+        group: usize,
+        columns: &ProjectionMask,
+        promised: &mut Promised,
+    ) -> std::result::Result<(), String> {
         for (i, column) in self.metadata.metadata().row_group(group).columns().iter().enumerate() {
             if !columns.leaf_included(i) {
                 continue;
@@ -179,6 +200,14 @@ impl ParquetFile {
             let (mut at, length) = column.byte_range();
             let end = at.checked_add(length).filter(|end| *end <= self.source.length);
             let Some(end) = end else { return Err(format!("a column of {length} bytes from byte {at} on")) };
+            let texts = column.column_type() == Type::BYTE_ARRAY;
+            // A dictionary's longest text may stand in every row.
+            let mut longest = match column.column_type() {
+                Type::FIXED_LEN_BYTE_ARRAY => {
+                    column.column_descr().type_length().max(0).unsigned_abs().into()
+                }
+                _ => 0,
+            };
             let mut values = 0_u64;
             while at < end {
                 let page = promises::page(self.source.from(at), end - at)?;
@@ -191,18 +220,42 @@ impl ParquetFile {
                     let Page { unpacked, stored, .. } = page;
                     return Err(format!("a page of {unpacked} bytes packed into {stored}"));
                 }
-                values = if page.dictionary {
-                    values.max(page.values)
-                } else {
-                    values.saturating_add(page.values)
-                };
-                if values > self.most(VALUES) {
-                    return Err(format!("{values} values, expected {}", self.fewer(VALUES, "values")));
+                values = values.saturating_add(page.values);
+                promised.add(page.values, 0);
+                if texts && page.dictionary {
+                    longest = longest.max(self.longest_text(at, &page, column.compression())?);
+                }
+                if texts && page.shares_prefixes {
+                    promised.add(0, page.values.saturating_mul(page.unpacked));
                 }
                 at += page.header + page.stored;
             }
+            promised.add(0, values.saturating_mul(longest));
+            for (what, found, limit) in
+                [("values", promised.values, VALUES), ("bytes of text", promised.bytes, BYTES)]
+            {
+                if found > self.most(limit) {
+                    return Err(format!("{found} {what}, expected {}", self.fewer(limit, what)));
+                }
+            }
         }
         Ok(())
+    }
+
+    /// Length of the longest text in a page that begins at `at` and holds a dictionary.
+    fn longest_text(&self, at: u64, page: &Page, packed: Compression) -> std::result::Result<u64, String> {
+        let bytes = self.source.bytes(at + page.header, page.stored as usize).map_err(|e| e.to_string())?;
+        if packed != Compression::SNAPPY {
+            return Ok(promises::longest(&bytes));
+        }
+        match snap::raw::decompress_len(&bytes) {
+            Ok(length) if length as u64 <= page.unpacked => {}
+            Ok(length) => return Err(format!("a page of {length} bytes, expected {}", page.unpacked)),
+            Err(e) => return Err(format!("a dictionary that cannot be unpacked: {e}")),
+        }
+        let unpacked = snap::raw::Decoder::new().decompress_vec(&bytes);
+        let unpacked = unpacked.map_err(|e| format!("a dictionary that cannot be unpacked: {e}"))?;
+        Ok(promises::longest(&unpacked))
     }
 
     pub(crate) fn rows(&self) -> usize {
@@ -252,8 +305,9 @@ impl ParquetFile {
             let places = columns.iter().filter_map(|c| schema.index_of(c).ok());
             let mask = ProjectionMask::roots(builder.parquet_schema(), places);
             let broken = |from, e: String| file_error(&self.path, &what(from), "readable values", e);
+            let mut promised = Promised::default();
             for &group in &wanted {
-                self.look(group, &mask).map_err(|e| broken(rows.start, e))?;
+                self.look(group, &mask, &mut promised).map_err(|e| broken(rows.start, e))?;
             }
             let reader = builder
                 .with_projection(mask)

@@ -346,6 +346,23 @@ pub(super) struct Page {
     /// Values in it; for a page of a dictionary, those of the dictionary.
     pub(super) values: u64,
     pub(super) dictionary: bool,
+    /// Whether texts may begin with as much of the one before as they like.
+    pub(super) shares_prefixes: bool,
+}
+
+/// The number of Parquet's `DELTA_BYTE_ARRAY`.
+const DELTA_BYTE_ARRAY: i64 = 7;
+
+/// Length of the longest text in a dictionary, bytes.
+pub(super) fn longest(mut dictionary: &[u8]) -> u64 {
+    let mut longest = 0;
+    while let Some((length, rest)) = dictionary.split_first_chunk() {
+        let length = u32::from_le_bytes(*length);
+        // What is longer than the page is the decoder's to refuse.
+        let Some(rest) = rest.get(length as usize..) else { break };
+        (longest, dictionary) = (longest.max(length.into()), rest);
+    }
+    longest
 }
 
 /// Reads the header of a page; `left` bytes are left of its column.
@@ -364,6 +381,11 @@ pub(super) fn page(input: impl Read, left: u64) -> Result<Page, Wrong> {
             walker.fields(known, &mut |walker, inner, wire, kind| {
                 if inner == 1 && (4..=6).contains(&wire) {
                     page.values = page.values.max(size(walker.signed()?)?);
+                    return Ok(());
+                }
+                let encoding = if id == 8 { 4 } else { 2 };
+                if inner == encoding && (4..=6).contains(&wire) {
+                    page.shares_prefixes |= walker.signed()? == DELTA_BYTE_ARRAY;
                     return Ok(());
                 }
                 walker.value(wire, kind, false)
@@ -453,7 +475,7 @@ mod tests {
         .concat();
         let found = page(&header[..], 500).unwrap();
         let header = header.len() as u64;
-        assert_eq!(found, Page { header, stored: 60, unpacked: 100, values: 7, dictionary: false });
+        assert_eq!(found, Page { header, stored: 60, unpacked: 100, values: 7, ..Page::default() });
         assert!(page(&[0x15, 0, 0x15, 1][..], 500).unwrap_err().contains("a page of -1 bytes"));
     }
 }

@@ -567,6 +567,54 @@ fn pages_that_promise_more_than_they_hold_are_refused_before_there_is_memory_for
     assert!(message.contains("a page of 8191 bytes packed into"), "{message}");
 }
 
+/// One long text in a dictionary, and rows that all name it: a file of some kilobytes, half a gigabyte of texts.
+#[test]
+fn texts_that_a_dictionary_repeats_without_end_are_refused_before_there_is_memory_for_them() {
+    use arrow_array::{DictionaryArray, Int32Array, RecordBatch, StringArray, types::Int32Type};
+    use parquet::arrow::ArrowWriter;
+    use parquet::arrow::arrow_writer::ArrowWriterOptions;
+    use parquet::basic::Compression;
+    use parquet::file::properties::WriterProperties;
+    use std::sync::Arc;
+
+    let (_folder, root) = place();
+    std::fs::create_dir_all(&root).unwrap();
+    let path = root.join("file.parquet");
+    for (compression, rows, fails) in [
+        (Compression::SNAPPY, 1024, true),
+        (Compression::SNAPPY, 4, false),
+        (Compression::UNCOMPRESSED, 4096, true),
+        (Compression::UNCOMPRESSED, 4, false),
+    ] {
+        // Uncompressed files are large by themselves, and may unpack to so much more.
+        let long = "x".repeat(if compression == Compression::SNAPPY { 1 << 19 } else { 1 << 17 });
+        let texts = Arc::new(StringArray::from(vec![long.as_str()]));
+        let keys = Int32Array::from(vec![0; rows]);
+        let column = Arc::new(DictionaryArray::<Int32Type>::try_new(keys, texts).unwrap());
+        let batch = RecordBatch::try_from_iter([("note", column as _)]).unwrap();
+        let properties = WriterProperties::builder().set_compression(compression).build();
+        // Without Arrow's own schema a reader takes the column for plain texts.
+        let options = ArrowWriterOptions::new().with_properties(properties).with_skip_arrow_metadata(true);
+        let file = std::fs::File::create(&path).unwrap();
+        let mut writer = ArrowWriter::try_new_with_options(file, batch.schema(), options).unwrap();
+        writer.write(&batch).unwrap();
+        writer.close().unwrap();
+        let feature = Feature::scalar(Dtype::String);
+        let read =
+            super::parquet_file::ParquetFile::open(&path).unwrap().read(&[("note", &feature)], 0..rows);
+        if fails {
+            let message = read.unwrap_err().to_string();
+            assert!(
+                message.contains("column `note`") && message.contains("bytes of text, expected at most"),
+                "{message}"
+            );
+        } else {
+            let Column::Text(texts) = &read.unwrap()[0].1 else { panic!("no texts") };
+            assert_eq!((texts.len(), &texts[3]), (4, &long));
+        }
+    }
+}
+
 /// Names and texts of others stand in messages, which stay one line.
 #[test]
 fn what_files_say_does_not_break_a_message() {

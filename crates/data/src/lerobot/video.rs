@@ -35,8 +35,8 @@ pub(crate) fn read(
     let program = std::env::var_os(PROGRAM).filter(|p| !p.is_empty()).unwrap_or_else(|| "ffmpeg".into());
     let mut command = Command::new(&program);
     command.args(["-v", "error", "-nostdin", "-ss", &format!("{start:.6}")]);
-    // The file is what its name says: ffmpeg goes by the content, and what it takes for a playlist may name other files of
-    // this machine, and addresses.
+    // As MP4, which is what LeRobot writes: left to itself ffmpeg goes by the content, and what it takes for a playlist may name
+    // other files and addresses.
     command.args(["-protocol_whitelist", "file", "-f", "mp4", "-i"]).arg(prefixed("file:", path));
     command.args(["-frames:v", &count.to_string(), "-fps_mode", "passthrough"]);
     command.args(["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]);

@@ -260,7 +260,7 @@ fn datasets_of_other_robots_are_shown_whole() {
     }
     // Text of a row, the names of entries, and the places of a matrix that has no names.
     assert!(
-        html.contains("<dd><bdi>first</bdi></dd>") && html.contains("pan") && html.contains("1,2"),
+        html.contains("<dd><bdi>first</bdi></dd>") && html.contains(">lift<") && html.contains("1,2"),
         "columns"
     );
 
@@ -271,8 +271,11 @@ fn datasets_of_other_robots_are_shown_whole() {
     let columns = vec![("heights".to_owned(), Column::F32((0..600).map(|v| v as f32).collect()))];
     writer.push(&Table { rows: 3, columns }, "look").unwrap();
     writer.finish().unwrap();
-    write(&root, &out, &Options::default()).unwrap();
+    let position = Some("heights[3:6]".parse().unwrap());
+    write(&root, &out, &Options { position, ..Options::default() }).unwrap();
     let html = std::fs::read_to_string(&out).unwrap();
+    // 200 further in all three directions from row to row, ten rows a second.
+    assert!(html.contains("data-speed=\"3464.1016\""), "speed");
     assert!(html.contains("heights, 10 x 20") && html.contains("largest"), "a summary");
     assert!(!html.contains("9,19"), "one line an entry");
 }

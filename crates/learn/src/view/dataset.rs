@@ -53,8 +53,9 @@ impl DatasetSource {
         let own =
             |name: &str| !DEFAULT_FEATURES.iter().any(|(n, _)| *n == name) && !name.starts_with("source.");
         let small = |f: &Feature| !f.is_visual() && f.width() <= WIDEST;
-        let names: Vec<&str> =
-            info.features.iter().filter(|(_, f)| small(f)).map(|(n, _)| n.as_str()).collect();
+        let tool = |name: &str| self.position.as_ref().is_some_and(|p| p.column == name);
+        let read = info.features.iter().filter(|(n, f)| small(f) || tool(n));
+        let names: Vec<&str> = read.map(|(n, _)| n.as_str()).collect();
         let table = self.dataset.read_columns(index, &names)?;
         let mut recording = Recording {
             name: self.listed[index].name.clone(),

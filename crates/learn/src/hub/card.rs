@@ -17,8 +17,11 @@ pub(super) fn files(publication: &Publication) -> Result<Files> {
     let measured = results(dir)?;
     // Curve and table are of the run that made this policy; those of other seeds go along in the file.
     let p = &checkpoint.provenance;
-    let own =
-        measured.as_ref().and_then(|(runs, _)| runs.iter().find(|r| r.task == p.task && r.seed == p.seed));
+    let variant = p.run.pointer("/task/variant").and_then(serde_json::Value::as_str).unwrap_or_default();
+    let made = |r: &&RunResults| {
+        (&r.task, &r.preset, r.seed, r.variant.as_str()) == (&p.task, &p.preset, p.seed, variant)
+    };
+    let own = measured.as_ref().and_then(|(runs, _)| runs.iter().find(made));
     let read = |name| {
         let path = dir.join(name);
         Ok((name, std::fs::read(&path).map_err(io("reading", &path))?))
@@ -29,11 +32,9 @@ pub(super) fn files(publication: &Publication) -> Result<Files> {
     let card =
         card.unwrap_or_else(|| model_card(&publication.address, p, own, publication.license.as_deref()));
     files.push(("README.md", card.into_bytes()));
-    if let Some(own) = own {
+    if let (Some(own), Some((_, text))) = (own, &measured) {
         files.push(("curve.svg", chart::success_curve(&[own]).into_bytes()));
-    }
-    if let Some((_, text)) = measured {
-        files.push(("results.json", text.into_bytes()));
+        files.push(("results.json", text.clone().into_bytes()));
     }
     Ok(files)
 }

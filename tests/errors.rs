@@ -22,6 +22,8 @@ fn wrong_configuration_is_refused_before_any_work() {
     fails(&mut nut_assembly(&out, &["--device", "cuda"]), &["`cuda`", "without CUDA", "--features cuda"]);
     fails(&mut nut_assembly(&out, &["--device", "cuda:x"]), &["`cuda:x`", "expected cpu, cuda or cuda:N"]);
     fails(&mut nut_assembly(&out, &["--set", "device.fp16=true"]), &["device.fp16", "device.bf16"]);
+    let sharpness = &["--set", "train.step.keypoint_sharpness=0", "--set", "refine.goal.least=nan"];
+    fails(&mut nut_assembly(&out, sharpness), &["train.step.keypoint_sharpness", "refine.goal.least", "NaN"]);
     fails(&mut nut_assembly(&out, &["--threads", "0"]), &["threads", "at least 1"]);
     assert!(!out.exists(), "a refused run left a folder");
 }

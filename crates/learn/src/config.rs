@@ -270,6 +270,20 @@ impl RunConfig {
         );
         check(self.evaluation.trials > 0, "evaluation.trials: expected at least 1, got 0".to_owned());
         check(self.evaluation.parallel > 0, "evaluation.parallel: expected at least 1, got 0".to_owned());
+        let sharpness = self.train.step.keypoint_sharpness;
+        check(
+            sharpness.is_finite() && sharpness > 0.0,
+            format!("train.step.keypoint_sharpness: expected more than 0, got {sharpness}"),
+        );
+        let goal = &self.refine.goal;
+        check(
+            (0.0..=100.0).contains(&goal.percentile),
+            format!("refine.goal.percentile: expected 0 to 100, got {}", goal.percentile),
+        );
+        check(
+            goal.least.is_finite() && goal.least >= 0.0,
+            format!("refine.goal.least: expected 0 or more, got {}", goal.least),
+        );
         check(self.train.save_every > 0, "train.save_every: expected at least 1, got 0".to_owned());
         check(
             self.policy.cameras.is_empty() || self.env.cameras,

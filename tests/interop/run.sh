@@ -2,14 +2,19 @@
 # Do LeRobot and this project open, compare and extend each other's datasets, and open each other's policies? It needs Python
 # 3.10 to 3.12 and six gigabytes of packages, which go into a virtual environment of its own (E2H_INTEROP_ENV, by default
 # below target/), once.
-# Exit status: 0 everything holds, 1 something does not, 3 the packages could not be installed and nothing was run.
+# Exit status: 0 everything holds, 1 something does not, 2 a folder that is not ours, 3 the packages could not be installed and nothing was run.
 set -euo pipefail
 here="$(cd "$(dirname "$0")" && pwd)"
 root="$(cd "$here/../.." && pwd)"
 environment="${E2H_INTEROP_ENV:-$root/target/interop/environment}"
 python="$environment/bin/python"
 
-# An environment is whole when it says what was installed; one that was cut off, or is of other versions, is made anew.
+# An environment is whole when it says what was installed; one that was cut off, or is of other versions, is made anew. Of
+# folders elsewhere only those are taken for ours that say so.
+if [ -n "${E2H_INTEROP_ENV:-}" ] && [ -e "$environment" ] && [ ! -e "$environment/installed.txt" ]; then
+    echo "E2H_INTEROP_ENV: expected a new folder or one that this script made, found $environment" >&2
+    exit 2
+fi
 if ! cmp --silent "$here/requirements.txt" "$environment/installed.txt"; then
     echo "installing LeRobot into $environment"
     rm -rf "$environment"

@@ -14,6 +14,7 @@ mod dataset;
 mod episode;
 mod episodes;
 mod feature;
+mod limits;
 mod parquet_file;
 mod picture;
 mod promises;

@@ -2,8 +2,10 @@
 //! above, the wrist camera below.
 //!
 //! ```text
-//! cargo run --release --example gallery -- --out crates/env/pictures
+//! cargo run --release --example gallery                               # into runs/gallery
+//! cargo run --release --example gallery -- --out crates/env/pictures  # what the README shows
 //! ```
+#![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::{Context, Result};
 use clap::Parser;
@@ -15,7 +17,7 @@ use std::path::{Path, PathBuf};
 #[derive(Parser)]
 struct Arguments {
     /// Folder for one PNG a pair.
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", default_value = "runs/gallery")]
     out: PathBuf,
     /// One pair instead of all.
     #[arg(long)]
@@ -43,6 +45,7 @@ fn main() -> Result<()> {
         let path = arguments.out.join(format!("{name}.png"));
         let columns = draw(name, arguments.size, arguments.seed)?;
         write(&path, &columns).with_context(|| format!("writing {}", path.display()))?;
+        println!("{}", path.display());
     }
     Ok(())
 }

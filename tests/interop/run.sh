@@ -2,7 +2,8 @@
 # Do LeRobot and this project open, compare and extend each other's datasets, and open each other's policies? It needs Python
 # 3.10 to 3.12 and six gigabytes of packages, which go into a virtual environment of its own (E2H_INTEROP_ENV, by default
 # below target/), once.
-# Exit status: 0 everything holds, 1 something does not, 2 a folder that is not ours, 3 the packages could not be installed and nothing was run.
+# Exit status: 0 everything holds, 1 something does not, 2 a folder that is not ours, 3 the packages could not be installed and
+# nothing was run.
 set -euo pipefail
 here="$(cd "$(dirname "$0")" && pwd)"
 root="$(cd "$here/../.." && pwd)"
@@ -18,6 +19,9 @@ fi
 if ! cmp --silent "$here/requirements.txt" "$environment/installed.txt"; then
     echo "installing LeRobot into $environment"
     rm -rf "$environment"
+    # Empty for now: ours, and not whole.
+    mkdir -p "$environment"
+    : > "$environment/installed.txt"
     if ! why="$({ python3 -m venv "$environment" && "$python" -m pip install --quiet -r "$here/requirements.txt"; } 2>&1)"; then
         echo "NOT RUN: LeRobot's packages could not be installed: $(grep -v '^$\|notice' <<< "$why" | tail -n 1)"
         exit 3

@@ -615,6 +615,43 @@ fn texts_that_a_dictionary_repeats_without_end_are_refused_before_there_is_memor
     }
 }
 
+/// The same by texts that each begin with all of the one before.
+#[test]
+fn texts_that_share_their_beginnings_without_end_are_refused_too() {
+    use arrow_array::{RecordBatch, StringArray};
+    use parquet::arrow::ArrowWriter;
+    use parquet::basic::{Compression, Encoding};
+    use parquet::file::properties::WriterProperties;
+    use std::sync::Arc;
+
+    let (_folder, root) = place();
+    std::fs::create_dir_all(&root).unwrap();
+    let path = root.join("file.parquet");
+    let long = "x".repeat(1 << 19);
+    for (rows, fails) in [(4, false), (1024, true)] {
+        let batch =
+            RecordBatch::try_from_iter([("note", Arc::new(StringArray::from(vec![long.as_str(); 4])) as _)])
+                .unwrap();
+        let properties = WriterProperties::builder()
+            .set_compression(Compression::SNAPPY)
+            .set_dictionary_enabled(false)
+            .set_encoding(Encoding::DELTA_BYTE_ARRAY)
+            .build();
+        let file = std::fs::File::create(&path).unwrap();
+        let mut writer = ArrowWriter::try_new(file, batch.schema(), Some(properties)).unwrap();
+        (0..rows / 4).for_each(|_| writer.write(&batch).unwrap());
+        writer.close().unwrap();
+        assert!(std::fs::metadata(&path).unwrap().len() < 100_000, "the texts share nothing");
+        let feature = Feature::scalar(Dtype::String);
+        let read =
+            super::parquet_file::ParquetFile::open(&path).unwrap().read(&[("note", &feature)], 0..rows);
+        match read {
+            Ok(columns) => assert!(!fails && columns[0].1 == Column::Text(vec![long.clone(); rows])),
+            Err(e) => assert!(fails && e.to_string().contains("bytes of text, expected at most"), "{e}"),
+        }
+    }
+}
+
 /// Names and texts of others stand in messages, which stay one line.
 #[test]
 fn what_files_say_does_not_break_a_message() {

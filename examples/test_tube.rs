@@ -18,7 +18,7 @@ fn main() -> anyhow::Result<()> {
 
     // Line 1: easy demonstrations, their reversal, and a policy from each.
     let base = run.demonstrations()?;
-    let easy = run.train_easy(&base)?;
+    let mut easy = run.train_easy(&base)?;
     let mut hard = run.train_initial(&base)?;
     let mut records = vec![run.evaluate(0, &hard, None)?];
 
@@ -33,6 +33,7 @@ fn main() -> anyhow::Result<()> {
             }
         };
         hard = run.update(n, &hard, &base, &run.training_set(n, &accepted)?)?;
+        easy = run.update_easy(n, easy, &base)?; // the paper's stays as it is
         records.push(run.evaluate(n, &hard, Some(&accepted))?);
     }
 

@@ -7,6 +7,10 @@ pub type State = [f32; STATE_DIM];
 /// (1 open, 0 closed).
 pub type Action = [f32; ACTION_DIM];
 
+/// By how much exploration displaced the goal of a row: x, y, z in m along the axes of the robot's base, yaw in rad about the
+/// vertical; zeros where nothing did.
+pub type Excursion = [f32; 4];
+
 /// Which task of a pair: the hard one that is learned, or the easy one that undoes it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -160,7 +164,7 @@ impl Frames {
 /// One recorded episode, by column; row t of every column is one control step.
 ///
 /// # Shapes
-/// `state` (T, 15), `action` (T, 8), `frames` one entry a camera (T, H, W, 3), `source` (T).
+/// `state` (T, 15), `action` (T, 8), `frames` one entry a camera (T, H, W, 3), `source` (T), `excursion` (T, 4).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// State before the action of the same row.
@@ -171,6 +175,9 @@ pub struct Episode {
     pub frames: Vec<Frames>,
     /// Row of the original recording that each row comes from (the nearest one where poses were interpolated).
     pub source: Vec<u32>,
+    /// By how much exploration had displaced the goal when the row was observed: the pose in `state` is off the policy's own
+    /// way by about as much.
+    pub excursion: Vec<Excursion>,
     /// How it ended.
     pub outcome: Outcome,
     /// True when the last row is the end of the task, so that a policy may repeat the last action after it; false for a
@@ -192,6 +199,7 @@ impl Episode {
                 .map(|camera| Frames { camera: camera.clone(), height: 0, width: 0, data: vec![] })
                 .collect(),
             source: vec![],
+            excursion: vec![],
             outcome: Outcome::Timeout,
             terminal: true,
             origin,
@@ -210,7 +218,7 @@ impl Episode {
         self.state.is_empty()
     }
 
-    /// Appends one control step.
+    /// Appends one control step that nothing displaced.
     ///
     /// # Errors
     /// When the number of images or their size differs from the rows before.
@@ -235,6 +243,7 @@ impl Episode {
         self.source.push(self.state.len() as u32);
         self.state.push(observation.state);
         self.action.push(*action);
+        self.excursion.push(Excursion::default());
         Ok(())
     }
 
@@ -257,6 +266,7 @@ impl Episode {
                 })
                 .collect(),
             source: rows.iter().map(|&r| self.source[r]).collect(),
+            excursion: rows.iter().map(|&r| self.excursion[r]).collect(),
             outcome: self.outcome,
             terminal: self.terminal && rows.last().is_some_and(|&r| r + 1 == self.len()),
             origin: self.origin.clone(),
@@ -289,6 +299,7 @@ impl Episode {
         };
         rows("action", self.action.len())?;
         rows("source", self.source.len())?;
+        rows("excursion", self.excursion.len())?;
         for f in &self.frames {
             let n = (f.height * f.width * 3).max(1);
             rows(&f.camera, if f.data.len() % n == 0 { f.data.len() / n } else { usize::MAX })?;
@@ -299,6 +310,7 @@ impl Episode {
         for t in 0..self.len() {
             finite("state", t, &self.state[t])?;
             finite("action", t, &self.action[t])?;
+            finite("excursion", t, &self.excursion[t])?;
         }
         Ok(())
     }
@@ -330,6 +342,15 @@ mod tests {
         assert!(!s.terminal);
         assert!(e.select(&[0, 4]).terminal);
         s.validate().unwrap();
+    }
+
+    #[test]
+    fn excursions_go_where_their_rows_go() {
+        let mut e = episode(3);
+        e.excursion[2] = [0.03, 0.0, 0.01, 0.2];
+        assert_eq!(e.select(&[2, 0]).excursion, [[0.03, 0.0, 0.01, 0.2], [0.0; 4]]);
+        e.excursion.pop();
+        assert!(matches!(e.validate(), Err(Error::Rows { expected: 3, found: 2, .. })));
     }
 
     #[test]

@@ -19,7 +19,9 @@ mod random;
 mod spelling;
 mod traits;
 
-pub use episode::{Action, Direction, Episode, Frames, Image, Kind, Observation, Origin, Outcome, State};
+pub use episode::{
+    Action, Direction, Episode, Excursion, Frames, Image, Kind, Observation, Origin, Outcome, State,
+};
 pub use pose::{Pose, align_hemisphere};
 pub use random::{Rng, stream};
 pub use spelling::{nearest, one_line};

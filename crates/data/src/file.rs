@@ -38,6 +38,11 @@ pub(crate) fn encode(episode: &Episode, path: &Path) -> Result<Vec<u8>> {
         ("action".to_owned(), view(Dtype::F32, vec![rows, ACTION_DIM], &action)?),
         ("source".to_owned(), view(Dtype::U32, vec![rows], &source)?),
     ];
+    let excursion: Vec<u8> = episode.excursion.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+    // Files without it are those of episodes that nothing displaced, and of earlier versions.
+    if episode.excursion.iter().flatten().any(|&v| v != 0.0) {
+        tensors.push(("excursion".to_owned(), view(Dtype::F32, vec![rows, 4], &excursion)?));
+    }
     for f in &episode.frames {
         let shape = vec![rows, f.height, f.width, 3];
         tensors.push((format!("frames.{}", f.camera), view(Dtype::U8, shape, &f.data)?));
@@ -97,6 +102,9 @@ fn check_columns(header: &Header, metadata: &Metadata, path: &Path) -> Result<us
     let mut found: Vec<String> = metadata.offset_keys();
     let mut expected = vec!["state".to_owned(), "action".to_owned(), "source".to_owned()];
     expected.extend(header.cameras.iter().map(|c| format!("frames.{c}")));
+    if found.iter().any(|name| name == "excursion") {
+        expected.push("excursion".to_owned());
+    }
     found.sort();
     expected.sort();
     if found != expected {
@@ -110,6 +118,7 @@ fn check_columns(header: &Header, metadata: &Metadata, path: &Path) -> Result<us
             "state" => (Dtype::F32, vec![rows, STATE_DIM]),
             "action" => (Dtype::F32, vec![rows, ACTION_DIM]),
             "source" => (Dtype::U32, vec![rows]),
+            "excursion" => (Dtype::F32, vec![rows, 4]),
             _ if shape.len() == 4 => (Dtype::U8, vec![rows, shape[1], shape[2], 3]),
             _ => (Dtype::U8, vec![rows, 0, 0, 3]),
         };
@@ -123,7 +132,7 @@ fn check_columns(header: &Header, metadata: &Metadata, path: &Path) -> Result<us
 
 /// The episode in `bytes`.
 pub(crate) fn decode(bytes: &[u8], path: &Path) -> Result<Episode> {
-    let Found { header, .. } = header(bytes, path)?;
+    let Found { header, rows: length, .. } = header(bytes, path)?;
     let broken = |e: SafeTensorError| file_error(path, "file", WHOLE, e.to_string());
     let file = SafeTensors::deserialize(bytes).map_err(broken)?;
     let tensor = |name: &str| file.tensor(name).map_err(broken);
@@ -137,6 +146,7 @@ pub(crate) fn decode(bytes: &[u8], path: &Path) -> Result<Episode> {
         action: rows(tensor("action")?.data()),
         frames: header.cameras.iter().map(camera).collect::<Result<_>>()?,
         source: tensor("source")?.data().as_chunks().0.iter().map(|b| u32::from_le_bytes(*b)).collect(),
+        excursion: tensor("excursion").map_or_else(|_| vec![[0.0; 4]; length], |t| rows(t.data())),
         outcome: header.outcome,
         terminal: header.terminal,
         origin: header.origin,

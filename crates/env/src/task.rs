@@ -57,6 +57,12 @@ pub trait Task: Send + Sync {
     /// Whether the scene is in a goal state of `direction` right now.
     fn success(&self, direction: Direction, sim: &Sim) -> bool;
 
+    /// How far the object is from all that guides or holds it at its goals, m; 0 or less while something does. There is room for
+    /// an excursion as far as this. By default, for pairs without a hole: how far it is beyond 5 cm from where the episode began.
+    fn room(&self, sim: &Sim) -> f64 {
+        (sim.object().position - sim.object_start().position).norm() - 0.05
+    }
+
     /// Whether the object has to be held throughout: dropping it then ends the episode.
     fn holds(&self) -> bool {
         false

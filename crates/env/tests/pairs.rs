@@ -347,3 +347,22 @@ fn an_unreachable_goal_leaves_the_arm_sound() {
     env.home().unwrap();
     assert!((env.sim().tcp().position - env.sim().home().position).norm() < 1e-3);
 }
+
+#[test]
+fn there_is_no_room_for_an_excursion_at_the_goal_and_some_on_the_way() {
+    each(|task, env| {
+        for k in 0..20 {
+            env.reset(Direction::Easy, &mut rng("room", k)).unwrap();
+            let room = task.room(env.sim());
+            assert!(room <= 0.0, "{}: {room} m at an easy start", label(task));
+        }
+        let mut expert = task.expert(Direction::Easy, &DemonstratorConfig::clean(), &mut rng("room", 20));
+        let mut most = f64::NEG_INFINITY;
+        while !expert.done() && env.steps() < env.horizon(Direction::Easy) {
+            let action = expert.act(env.sim());
+            env.step(&action).unwrap();
+            most = most.max(task.room(env.sim()));
+        }
+        assert!(most > 0.03, "{}: {most} m at best", label(task));
+    });
+}

@@ -1,6 +1,8 @@
 //! Closed-loop collection: the hard policy, then the easy policy from where it ended, and so on.
 
 use crate::config::{AfterFailure, LoopConfig};
+use crate::explore::Wander;
+use crate::record::Automatic;
 use crate::rollout::{Finished, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Episode, Kind, Origin, Outcome, Policy, stream};
@@ -22,6 +24,17 @@ pub struct Collected {
     pub easy_successes: usize,
     /// External resets by cause.
     pub resets: BTreeMap<String, usize>,
+    /// Cycles with exploration.
+    pub explored: Automatic,
+    /// Cycles without.
+    pub plain: Automatic,
+}
+
+impl Collected {
+    /// The account of the kind of cycle that `cycle` is.
+    fn kind(&mut self, config: &LoopConfig, cycle: usize) -> &mut Automatic {
+        if config.explore.explores(cycle) { &mut self.explored } else { &mut self.plain }
+    }
 }
 
 /// One loop's own state.
@@ -64,7 +77,13 @@ pub fn collect(
         };
         let rng = stream(seed, purpose, iteration, cycle as u64);
         let record = Some(origin_of(direction, cycle));
-        lane.rollout = Some(Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, record)?);
+        let rollout = Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, record)?;
+        let explores = direction == Direction::Easy && config.explore.explores(cycle);
+        let wander = explores.then(|| {
+            let mut rng = stream(seed, "collect/explore", iteration, cycle as u64);
+            Wander::new(&config.explore, origin.iteration, &mut rng)
+        });
+        lane.rollout = Some(rollout.wandering(wander));
         Ok(())
     };
     let reset = |lane: &mut Lane<Loop>, direction: Direction, cause: &str| -> Result<()> {
@@ -86,10 +105,18 @@ pub fn collect(
             Direction::Hard => {
                 lane.state.collected.hard.push(episode);
                 lane.state.at_goal = true;
-                match (success, accident, config.after_failure) {
-                    (_, Some(cause), _) => reset(lane, Direction::Easy, cause)?,
-                    (false, _, AfterFailure::Assembled) => reset(lane, Direction::Easy, "hard_failed")?,
-                    _ => {
+                let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
+                let cause = match (success, accident, config.after_failure) {
+                    (_, Some(cause), _) => Some(cause),
+                    (false, _, AfterFailure::Assembled) => Some("hard_failed"),
+                    _ => None,
+                };
+                let kind = lane.state.collected.kind(config, cycle);
+                kind.cycles += 1;
+                kind.resets += usize::from(cause.is_some());
+                match cause {
+                    Some(cause) => reset(lane, Direction::Easy, cause)?,
+                    None => {
                         lane.state.at_goal = success;
                         if config.homing {
                             lane.env.home()?;
@@ -102,6 +129,11 @@ pub fn collect(
             Direction::Easy => {
                 let collected = &mut lane.state.collected;
                 collected.easy_successes += usize::from(success);
+                if let Some(&cycle) = lane.state.cycles.front() {
+                    let kind = collected.kind(config, cycle);
+                    kind.easy_successes += usize::from(success);
+                    kind.resets += usize::from(!success);
+                }
                 if success && lane.state.at_goal {
                     collected.easy.push(episode);
                 } else if config.keep_rollouts {
@@ -168,6 +200,8 @@ pub fn collect(
         all.rejected.extend(c.rejected);
         all.easy_rollouts += c.easy_rollouts;
         all.easy_successes += c.easy_successes;
+        all.explored += c.explored;
+        all.plain += c.plain;
         for (cause, n) in c.resets {
             *all.resets.entry(cause).or_default() += n;
         }

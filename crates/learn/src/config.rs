@@ -1,6 +1,6 @@
 //! A run's configuration: preset < task file < `--set key=value`, checked before any work.
 
-use crate::{Error, Result};
+use crate::{Error, ExploreConfig, Result};
 use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
 use e2h_nn::Precision;
@@ -123,6 +123,9 @@ pub struct LoopConfig {
     /// `iteration_NN/rollouts`. False keeps what is learned from. Checkpoints from before it have none.
     #[serde(default)]
     pub keep_rollouts: bool,
+    /// Exploration of easy rollouts. Checkpoints from before it have none.
+    #[serde(default)]
+    pub explore: ExploreConfig,
 }
 
 /// Training steps and how a step looks.
@@ -135,6 +138,10 @@ pub struct StageConfig {
     pub initial_steps: usize,
     /// Steps of each update.
     pub update_steps: usize,
+    /// Steps of each update of the easy policy on its own successes; 0 leaves it as it is (the paper's). Checkpoints from before
+    /// it have none.
+    #[serde(default)]
+    pub easy_update_steps: usize,
     /// Steps between two saved training states, for `--resume`.
     pub save_every: usize,
     /// Fraction by which the ranges of the normaliser are widened.
@@ -262,6 +269,9 @@ impl RunConfig {
             }
         };
         let l = &self.closed_loop;
+        for problem in l.explore.validate(l.iterations) {
+            check(false, format!("loop.explore.{problem}"));
+        }
         check(l.demonstrations > 0, "loop.demonstrations: expected at least 1, got 0".to_owned());
         check(l.loops > 0, "loop.loops: expected at least 1, got 0".to_owned());
         check(

@@ -51,6 +51,12 @@ pub struct Collection {
     pub easy_rollouts: usize,
     /// External resets by cause, for example `hard_failed`, `easy_failed`, `diverged`, `start`.
     pub resets: BTreeMap<String, usize>,
+    /// Cycles whose easy rollout explored; none in records from before there was exploration.
+    #[serde(default)]
+    pub explored: Automatic,
+    /// The other cycles.
+    #[serde(default)]
+    pub plain: Automatic,
     /// Easy rollouts whose reversal passed the gripper gate.
     pub accepted: usize,
     /// Frames of the accepted reversals by fate; the values add up to the frames that went in.
@@ -63,6 +69,33 @@ pub struct Collection {
     pub critic_loss: Option<f64>,
     /// Why a stage was skipped, in words; empty when none was.
     pub notes: Vec<String>,
+}
+
+/// How one kind of cycle went on by itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Automatic {
+    /// Cycles of this kind.
+    pub cycles: usize,
+    /// Easy rollouts that succeeded in them.
+    pub easy_successes: usize,
+    /// External resets that followed a rollout of theirs.
+    pub resets: usize,
+}
+
+impl Automatic {
+    /// Share of cycles that needed no external reset, in [0, 1]; none without cycles.
+    #[must_use]
+    pub fn rate(&self) -> Option<f64> {
+        (self.cycles > 0).then(|| 1.0 - self.resets.min(self.cycles) as f64 / self.cycles as f64)
+    }
+}
+
+impl std::ops::AddAssign for Automatic {
+    fn add_assign(&mut self, other: Self) {
+        self.cycles += other.cycles;
+        self.easy_successes += other.easy_successes;
+        self.resets += other.resets;
+    }
 }
 
 impl Collection {

@@ -5,6 +5,7 @@
 //! threads nor their timing can change a result.
 
 use crate::Result;
+use crate::explore::Wander;
 use e2h_core::{Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng};
 use e2h_env::Env;
 use rayon::prelude::*;
@@ -32,6 +33,7 @@ pub(crate) struct Rollout {
     /// None: frames are rendered only where the policy looks (evaluation).
     episode: Option<Episode>,
     film: Option<Film>,
+    wander: Option<Wander>,
     steps: usize,
 }
 
@@ -56,7 +58,7 @@ impl Rollout {
         let first = env.observe()?;
         let history = std::iter::repeat_n(first, n_obs_steps).collect();
         let episode = record.map(|origin| Episode::new(origin, env.cameras()));
-        Ok(Self { direction, rng, history, episode, film: None, steps: 0 })
+        Ok(Self { direction, rng, history, episode, film: None, wander: None, steps: 0 })
     }
 
     /// Films the rollout from its present state on.
@@ -66,13 +68,24 @@ impl Rollout {
         Ok(self)
     }
 
+    /// Displaces the goals of the rollout.
+    pub(crate) fn wandering(mut self, wander: Option<Wander>) -> Self {
+        self.wander = wander;
+        self
+    }
+
     /// Executes `chunk`; Some when the episode ended in it.
     pub(crate) fn execute(&mut self, env: &mut Env, chunk: &[Action]) -> Result<Option<Finished>> {
         for (i, action) in chunk.iter().enumerate() {
+            let excursion = self.wander.as_ref().map(Wander::now);
+            let action = self.wander.as_mut().map_or(*action, |w| w.displace(env, action));
             if let (Some(episode), Some(now)) = (&mut self.episode, self.history.back()) {
-                episode.push(now, action)?;
+                episode.push(now, &action)?;
+                if let (Some(row), Some(excursion)) = (episode.excursion.last_mut(), excursion) {
+                    *row = excursion;
+                }
             }
-            let end = env.step(action)?;
+            let end = env.step(&action)?;
             self.steps += 1;
             if let Some(film) = self.film.as_mut().filter(|_| self.steps.is_multiple_of(2) || end.is_some()) {
                 film.shoot(env)?;

@@ -195,15 +195,16 @@ impl Run {
             }
         };
         let r = &c.refine;
-        let filtered = |episode: Episode, filter: bool| -> Vec<Episode> {
-            if filter { kinematic_filter(&episode, &r.kinematic, &r.reverse).segments } else { vec![episode] }
+        let reversed = |e: &Episode| -> Vec<Episode> {
+            let hard = reverse(e, &r.reverse);
+            if c.closed_loop.refine_demonstrations {
+                kinematic_filter(&hard, &r.kinematic, &r.reverse).segments
+            } else {
+                vec![hard]
+            }
         };
-        let hard: Vec<Episode> = easy
-            .iter()
-            .flat_map(|e| filtered(reverse(e, &r.reverse), c.closed_loop.refine_demonstrations))
-            .collect();
-        let easy_training: Vec<Episode> =
-            easy.iter().flat_map(|e| filtered(e.clone(), c.closed_loop.refine_easy_demonstrations)).collect();
+        let hard: Vec<Episode> = easy.iter().flat_map(reversed).collect();
+        let easy_training: Vec<Episode> = easy.iter().flat_map(|e| self.easy_lessons(e.clone())).collect();
         let config = NormaliserConfig { margin: c.train.normaliser_margin, ..NormaliserConfig::default() };
         let normaliser = Normaliser::fit(&hard, &config)?;
         Ok(Base {
@@ -258,6 +259,39 @@ impl Run {
             data,
             Some(policy),
         )
+    }
+
+    /// Continues the easy policy on `D_e^(0)` and what it has done well in the loop so far, exploration included; where
+    /// `train.easy_update_steps` is 0 it stays as it is.
+    ///
+    /// # Errors
+    /// As [`Run::train_easy`].
+    pub fn update_easy(&self, iteration: u32, easy: DiffusionPolicy, base: &Base) -> Result<DiffusionPolicy> {
+        let mut own = vec![];
+        if self.config().train.easy_update_steps > 0 && iteration < self.iterations() {
+            for n in 1..=iteration {
+                let found = self.dir.get_episodes::<usize>(&folder(n, "easy_segments"))?;
+                own.extend(found.into_iter().flat_map(|(segments, _)| segments).map(Arc::new));
+            }
+        }
+        if own.is_empty() {
+            return Ok(easy);
+        }
+        let steps = self.config().train.easy_update_steps;
+        let place = folder(iteration, "policy_easy");
+        let name = format!("train easy {iteration}");
+        let data = (&base.easy_training[..], &own[..]);
+        self.train(&place, &name, Direction::Easy, iteration, steps, base, data, Some(&easy))
+    }
+
+    /// What the easy policy learns of an episode of its own task.
+    fn easy_lessons(&self, episode: Episode) -> Vec<Episode> {
+        let r = &self.config().refine;
+        if self.config().closed_loop.refine_easy_demonstrations {
+            kinematic_filter(&episode, &r.kinematic, &r.reverse).segments
+        } else {
+            vec![episode]
+        }
     }
 
     #[allow(
@@ -509,6 +543,11 @@ impl Run {
         let reversals: Vec<Reversal> =
             candidates.iter().zip(&refined).map(|(e, r)| Reversal::new(e, r)).collect();
         self.dir.put_compact(&folder(iteration, "reversals.json"), &reversals)?;
+        if c.train.easy_update_steps > 0 {
+            let own: Vec<Episode> =
+                collected.easy.iter().flat_map(|e| self.easy_lessons(e.clone())).collect();
+            self.dir.put_episodes(&folder(iteration, "easy_segments"), &own, &own.len())?;
+        }
         let segments: Vec<Episode> =
             refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty()).collect();
         let collection = Collection {
@@ -517,6 +556,8 @@ impl Run {
             easy_successes: collected.easy_successes,
             easy_rollouts: collected.easy_rollouts,
             resets: collected.resets,
+            explored: collected.explored,
+            plain: collected.plain,
             accepted: candidates.len(),
             fates,
             segments: segments.len(),

@@ -1,5 +1,6 @@
 //! Host-side assembly of what the network is fed: every number passes through here once.
 
+use crate::config::TOOL_FRAME;
 use crate::{ImageScaling, PolicyConfig, Result};
 use candle_core::{Device, Tensor};
 use e2h_core::{Episode, Observation, Rng, State};
@@ -24,6 +25,7 @@ pub(crate) struct Host {
     images: Vec<Vec<f32>>,
     samples: usize,
     relative: bool,
+    tool_frame: bool,
     /// Largest normalised state entry.
     limit: f32,
     scaling: Vec<ImageScaling>,
@@ -37,6 +39,7 @@ impl Host {
             images: vec![vec![]; if config.n_image_steps == 0 { 0 } else { config.cameras.len() }],
             samples: 0,
             relative: config.relative_features,
+            tool_frame: config.tool_frame_features,
             limit: if config.state_limit > 0.0 { config.state_limit } else { f32::INFINITY },
             scaling: config.image_scaling.clone(),
             side: config.image_size,
@@ -57,6 +60,9 @@ impl Host {
             if self.relative {
                 // In units of 10 cm: centred on zero and of the order of one, whatever the task's ranges are.
                 self.state.extend((0..3).map(|i| limit((state[7 + i] - state[i]) * 10.0)));
+            }
+            if self.tool_frame {
+                self.state.extend(in_tool_frame(state).map(limit));
             }
             if let Some((sigma, rng)) = &mut noise
                 && *sigma > 0.0
@@ -113,6 +119,27 @@ impl Host {
     }
 }
 
+/// The object's pose in the frame of the tool: position in units of 10 cm, and the first two columns of the rotation matrix.
+fn in_tool_frame(state: &State) -> [f32; TOOL_FRAME] {
+    let columns = |q: &[f32]| {
+        let n = q.iter().map(|v| v * v).sum::<f32>().max(1e-12);
+        let [w, x, y, z] = [0, 1, 2, 3].map(|i| q[i] / n.sqrt());
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
+            [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
+            [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    };
+    let (tool, object) = (columns(&state[3..7]), columns(&state[10..14]));
+    let seen = |v: [f32; 3]| tool.map(|axis| axis.iter().zip(&v).map(|(a, b)| a * b).sum::<f32>());
+    let position = seen([0, 1, 2].map(|i| (state[7 + i] - state[i]) * 10.0));
+    let mut out = [0.0; TOOL_FRAME];
+    for (slot, v) in out.iter_mut().zip([position, seen(object[0]), seen(object[1])].concat()) {
+        *slot = v;
+    }
+    out
+}
+
 impl ImageScaling {
     /// Scales (..., 3) pixels in [0, 1].
     pub(crate) fn apply(&self, pixels: &mut [f32]) {
@@ -135,5 +162,32 @@ impl PolicyConfig {
     pub(crate) fn random_crop(&self, rng: &mut Rng) -> Corner {
         let room = self.image_size - self.crop_size;
         (rng.random_range(0..=room), rng.random_range(0..=room))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tool_sees_the_same_wherever_both_are_and_however_they_are_turned() {
+        let row = |tool: [f32; 7], object: [f32; 7]| {
+            let mut state = State::default();
+            state[..7].copy_from_slice(&tool);
+            state[7..14].copy_from_slice(&object);
+            state
+        };
+        // A tool that points down sees an object 10 cm below it ahead, and its z axis turned over.
+        let down = [0.0, 1.0, 0.0, 0.0];
+        let a = in_tool_frame(&row([0.5, 0.1, 0.2, 0.0, 1.0, 0.0, 0.0], [0.5, 0.1, 0.1, 1.0, 0.0, 0.0, 0.0]));
+        assert_eq!(a, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0]);
+        // Both carried elsewhere and turned by 0.7 rad about the vertical; a quaternion's sign says nothing.
+        let (s, c) = (0.35_f32.sin(), 0.35_f32.cos());
+        let turned = [c * down[0] - s * down[3], c * down[1] - s * down[2], c * down[2] + s * down[1], 0.0];
+        let b = in_tool_frame(&row(
+            [-0.2, 0.3, 0.5, turned[0], turned[1], turned[2], turned[3]],
+            [-0.2, 0.3, 0.4, -c, 0.0, 0.0, -s],
+        ));
+        assert!(a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-6), "{a:?} {b:?}");
     }
 }

@@ -94,6 +94,9 @@ pub struct PolicyConfig {
     /// Scaling of the images, one entry a camera; none leaves them in [0, 1].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub image_scaling: Vec<ImageScaling>,
+    /// Adds the object's pose in the frame of the tool, position and rotation: a grasp looks the same at every yaw.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub tool_frame_features: bool,
 }
 
 /// An object that rolled off the table would otherwise drive a network to where no data ever were.
@@ -133,6 +136,9 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
+/// Numbers of a pose in the tool's frame: position, and two columns of the rotation matrix, which have no jump at any turn.
+pub(crate) const TOOL_FRAME: usize = 9;
+
 /// Levels of a U-Net; each halves the horizon.
 const MOST_LEVELS: usize = 16;
 
@@ -167,13 +173,15 @@ impl PolicyConfig {
             state_limit: STATE_LIMIT,
             unit_quaternion: true,
             image_scaling: vec![],
+            tool_frame_features: false,
         }
     }
 
     /// Numbers a state row becomes for the network.
     #[must_use]
     pub fn state_features(&self) -> usize {
-        e2h_core::STATE_DIM + if self.relative_features { 3 } else { 0 }
+        let more = |on: bool, n: usize| if on { n } else { 0 };
+        e2h_core::STATE_DIM + more(self.relative_features, 3) + more(self.tool_frame_features, TOOL_FRAME)
     }
 
     /// Width of the U-Net's global condition.

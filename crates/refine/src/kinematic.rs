@@ -182,7 +182,7 @@ fn assemble(episode: &Episode, nodes: &[Node], reverse: &ReverseConfig) -> Episo
         state[..7].copy_from_slice(&node.pose.to_row(&reverse.reference_quaternion));
     }
     let poses: Vec<Pose> = nodes.iter().map(|n| n.pose).collect();
-    out.action = goals(&poses, &open_states(&out, reverse), reverse);
+    out.action = goals(&poses, &open_states(&out, reverse), &out.excursion, reverse);
     out
 }
 

@@ -1,6 +1,19 @@
 use crate::gripper::open_states;
-use e2h_core::{Action, Episode, Pose};
+use e2h_core::{Action, Episode, Excursion, Pose};
+use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
+
+/// What the actions of a path that exploration displaced lead to.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Labels {
+    /// The poses that were reached: the way back is the way that was come.
+    #[default]
+    Travelled,
+    /// Those poses less the excursion, which leads straight back to the policy's own way (as in DART, arXiv 1703.09327). Where
+    /// the gripper works the excursion stays in: the object is where the hand is.
+    Undisturbed,
+}
 
 /// How actions are rebuilt from a path.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -17,6 +30,11 @@ pub struct ReverseConfig {
     pub close_at: f64,
     /// Quaternions are written in the hemisphere of this one (wxyz); the task's reference.
     pub reference_quaternion: [f64; 4],
+    /// What the actions of a path that exploration displaced lead to.
+    pub labels: Labels,
+    /// With [`Labels::Undisturbed`]: nearer than this to a switch of the gripper the excursion stays in, control steps; over as
+    /// many more it goes out.
+    pub labels_fade: usize,
 }
 
 impl Default for ReverseConfig {
@@ -27,6 +45,8 @@ impl Default for ReverseConfig {
             open_at: 0.95,
             close_at: 0.85,
             reference_quaternion: [0.0, 1.0, 0.0, 0.0],
+            labels: Labels::Travelled,
+            labels_fade: 8,
         }
     }
 }
@@ -81,12 +101,25 @@ pub fn reverse(episode: &Episode, config: &ReverseConfig) -> Episode {
 /// the width itself, because a gripper told to close to the width of the object does not squeeze it.
 pub fn rebuild_actions(episode: &mut Episode, config: &ReverseConfig) {
     let poses: Vec<Pose> = (0..episode.len()).map(|t| episode.eef(t)).collect();
-    episode.action = goals(&poses, &open_states(episode, config), config);
+    episode.action = goals(&poses, &open_states(episode, config), &episode.excursion, config);
 }
 
-/// One action a pose. Shapes: `open` has the length of `poses`.
-pub(crate) fn goals(poses: &[Pose], open: &[bool], config: &ReverseConfig) -> Vec<Action> {
+/// One action a pose. Shapes: `open` and `excursions` have the length of `poses`.
+pub(crate) fn goals(
+    poses: &[Pose],
+    open: &[bool],
+    excursions: &[Excursion],
+    config: &ReverseConfig,
+) -> Vec<Action> {
     let last = poses.len().saturating_sub(1);
+    let undisturbed: Vec<Pose>;
+    let poses = match config.labels {
+        Labels::Travelled => poses,
+        Labels::Undisturbed => {
+            undisturbed = without(poses, open, excursions, config.labels_fade);
+            &undisturbed
+        }
+    };
     // Several steps have the same goal only at the end, so rows are made once and looked up.
     let rows: Vec<[f32; 7]> = poses.iter().map(|p| p.to_row(&config.reference_quaternion)).collect();
     let goal = |t: usize| {
@@ -96,6 +129,21 @@ pub(crate) fn goals(poses: &[Pose], open: &[bool], config: &ReverseConfig) -> Ve
         action
     };
     (0..poses.len()).map(goal).collect()
+}
+
+/// The poses less their excursions, which stay in near a switch of the gripper.
+fn without(poses: &[Pose], open: &[bool], excursions: &[Excursion], fade: usize) -> Vec<Pose> {
+    let switches: Vec<usize> = (1..open.len()).filter(|&t| open[t] != open[t - 1]).collect();
+    let share = |t: usize| {
+        let near = switches.iter().map(|&s| t.abs_diff(s)).min().unwrap_or(usize::MAX);
+        (near.saturating_sub(fade) as f64 / fade.max(1) as f64).min(1.0)
+    };
+    let less = |(t, (pose, e)): (usize, (&Pose, &Excursion))| {
+        let [x, y, z, yaw] = e.map(|v| f64::from(v) * share(t));
+        let back = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw);
+        Pose::new(pose.position - Vector3::new(x, y, z), back * pose.orientation)
+    };
+    poses.iter().zip(excursions).enumerate().map(less).collect()
 }
 
 #[cfg(test)]
@@ -144,6 +192,32 @@ mod tests {
             e.action.iter().map(|a| a[7]).collect::<Vec<_>>(),
             [1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0]
         );
+    }
+
+    #[test]
+    fn labels_lead_along_the_way_that_was_come_or_straight_back() {
+        let mut easy = along(&[0.0, 0.01, 0.02, 0.03]);
+        easy.excursion = vec![[0.0; 4], [0.001, 0.0, 0.0, 0.1], [0.002, -0.003, 0.0, 0.2], [0.0; 4]];
+        let travelled = reverse(&easy, &reversal());
+        assert_eq!(travelled.action.iter().map(|a| a[0]).collect::<Vec<_>>(), [0.02, 0.01, 0.0, 0.0]);
+        assert_eq!(travelled.excursion[1], [0.002, -0.003, 0.0, 0.2]);
+        let straight = reverse(&easy, &ReverseConfig { labels: Labels::Undisturbed, ..reversal() });
+        assert_eq!(straight.state, travelled.state);
+        let goal = Pose::from_row(&straight.action[0][..7]);
+        assert!((goal.position - Vector3::new(0.018, 0.003, 0.0)).norm() < 1e-6);
+        assert!((goal.orientation.angle_to(&easy.eef(2).orientation) - 0.2).abs() < 1e-6);
+        assert_eq!(straight.action[3], travelled.action[3]);
+    }
+
+    #[test]
+    fn excursions_stay_in_labels_where_the_gripper_works() {
+        let poses = vec![Pose::from_row(&[0.0; 7]); 12];
+        let open: Vec<bool> = (0..12).map(|t| t < 6).collect();
+        let config = ReverseConfig { labels: Labels::Undisturbed, labels_fade: 2, ..reversal() };
+        let goals = goals(&poses, &open, &[[0.01, 0.0, 0.0, 0.0]; 12], &config);
+        let x: Vec<f32> = goals.iter().map(|a| a[0]).collect();
+        // Row t leads to pose t + 1; the switch is at row 6.
+        assert_eq!(x, [-0.01, -0.01, -0.005, 0.0, 0.0, 0.0, 0.0, 0.0, -0.005, -0.01, -0.01, -0.01]);
     }
 
     #[test]

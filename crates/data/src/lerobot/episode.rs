@@ -5,7 +5,7 @@ use super::table::{Column, Table, column_error};
 use super::{Dataset, Writer, picture};
 use crate::file::file_error;
 use crate::{Error, Result};
-use e2h_core::{ACTION_DIM, Direction, Episode, Frames, Kind, Origin, Outcome, STATE_DIM};
+use e2h_core::{ACTION_DIM, Direction, Episode, Excursion, Frames, Kind, Origin, Outcome, STATE_DIM};
 use std::path::Path;
 
 /// Names of the entries of `observation.state`; metres, unit quaternions (wxyz), metres of gripper opening.
@@ -35,6 +35,11 @@ const IMAGES: &str = "observation.images.";
 pub const SOURCE_FRAME: &str = "source.frame";
 /// What refinement made of the row: 0 kept; the other codes are those of the writer's filter.
 pub const SOURCE_FATE: &str = "source.fate";
+
+/// By how much exploration displaced the goal: x, y, z in m, yaw in rad.
+pub const SOURCE_EXCURSION: &str = "source.excursion";
+/// Names of the entries of [`SOURCE_EXCURSION`].
+pub const EXCURSION_NAMES: [&str; 4] = ["x", "y", "z", "yaw"];
 
 /// See [`source_columns`].
 const SOURCE: [(&str, Dtype); 11] = [
@@ -126,6 +131,7 @@ pub fn features(cameras: &[(String, usize, usize)]) -> Features {
     features.push(("action".to_owned(), Feature::vector(&ACTION_NAMES)));
     features.push(("next.success".to_owned(), Feature::scalar(Dtype::Bool)));
     features.extend(source_features());
+    features.push((SOURCE_EXCURSION.to_owned(), Feature::vector(&EXCURSION_NAMES)));
     features
 }
 
@@ -163,6 +169,7 @@ pub fn to_table(episode: &Episode, fates: &[i64]) -> Result<Table> {
     columns.push(("next.success".to_owned(), Column::Bool(success)));
     let (outcome, terminal) = (episode.outcome, episode.terminal);
     columns.extend(source_columns(&episode.origin, outcome, terminal, &episode.source, fates));
+    columns.push((SOURCE_EXCURSION.to_owned(), Column::F32(episode.excursion.concat())));
     Ok(Table { rows, columns })
 }
 
@@ -238,6 +245,12 @@ pub fn from_table(table: &Table, features: &Features, task: &str) -> Result<(Epi
         action: rows(table, "action")?,
         frames,
         source: source.collect::<Result<_>>()?,
+        // Datasets from before have no such column: nothing displaced them.
+        excursion: if features.iter().any(|(name, _)| name == SOURCE_EXCURSION) {
+            rows(table, SOURCE_EXCURSION)?
+        } else {
+            vec![Excursion::default(); table.rows]
+        },
         outcome,
         terminal: flag("source.terminal")?,
         origin,

@@ -28,8 +28,8 @@ mod writer;
 pub use check::{Fault, REMOVED, Report, check, repair};
 pub use dataset::Dataset;
 pub use episode::{
-    ACTION_NAMES, SOURCE_FATE, SOURCE_FRAME, STATE_NAMES, features, features_of, from_table, source_columns,
-    source_features, to_table,
+    ACTION_NAMES, EXCURSION_NAMES, SOURCE_EXCURSION, SOURCE_FATE, SOURCE_FRAME, STATE_NAMES, features,
+    features_of, from_table, source_columns, source_features, to_table,
 };
 pub use episodes::{EpisodeSpan, VideoSpan};
 pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Info, VERSION};

@@ -188,6 +188,13 @@ impl Task for Brush {
         }
     }
 
+    fn room(&self, sim: &Sim) -> f64 {
+        let brush = sim.object();
+        let end = brush.position - axis(&brush) * HANDLE_END;
+        let out = (end.z - RIM).max(beside(&end, &seat()) - 4.0 * RADIUS);
+        out.min((brush.position - Vector3::from(CRADLE)).norm() - LAID.0)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let noise = config.waypoint_noise_m;
         let along = Vector3::new(draw(rng, [-START.0[0], START.0[0]]), 0.0, 0.0);

@@ -122,6 +122,11 @@ impl Task for CylinderPickPlace {
         }
     }
 
+    fn room(&self, sim: &Sim) -> f64 {
+        let p = sim.object().position;
+        (p.z - HALF - RIM).max(beside(&p, &seat()) - 2.0 * RADIUS)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let noise = config.waypoint_noise_m;
         let table = Stand::open(START.draw(rng, HALF), Turn::Keep);

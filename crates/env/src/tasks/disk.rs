@@ -128,6 +128,11 @@ impl Task for Disk {
         }
     }
 
+    fn room(&self, sim: &Sim) -> f64 {
+        let p = sim.object().position;
+        (p.z - HALF - ROD.1).max(beside(&p, &seat()) - RADIUS - ROD.0)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let noise = config.waypoint_noise_m;
         let table = Stand::open(START.draw(rng, HALF), Turn::Keep);

@@ -8,7 +8,7 @@ use crate::pick_place::down;
 use crate::task::{Choice, Entry};
 use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::Rng as _;
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
@@ -137,6 +137,12 @@ impl Task for NutAssembly {
                 released && flat && self.in_box(&p) && sim.tcp().position.z - p.z > AWAY
             }
         }
+    }
+
+    fn room(&self, sim: &Sim) -> f64 {
+        let p = sim.object().position;
+        let over = p.z - NUT_HALF_HEIGHT - PEG_TOP;
+        over.max((p.xy() - Vector2::from(self.variant.peg)).norm() - self.variant.reach())
     }
 
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {

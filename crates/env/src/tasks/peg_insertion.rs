@@ -177,6 +177,11 @@ impl Task for PegInsertion {
         }
     }
 
+    fn room(&self, sim: &Sim) -> f64 {
+        let (peg, hole) = (sim.tcp(), sim.object());
+        axis(&peg).dot(&(hole.position - peg.position)) - PEG.1
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let home = near_home(rng, 0.3 * BACK, 0.05);
         Box::new(Script::new(config, rng, move |index, sim, _| {

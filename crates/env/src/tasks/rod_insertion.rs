@@ -161,6 +161,11 @@ impl Task for RodInsertion {
         true
     }
 
+    fn room(&self, sim: &Sim) -> f64 {
+        let tip = tip(&sim.object());
+        (tip.z - RIM).max((tip.xy() - over_hole(0.0).xy()).norm() - 4.0 * ROD.0)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let out = start(rng);
         let aside = scatter(rng, 0.15 * self.clearance.min(config.waypoint_noise_m));

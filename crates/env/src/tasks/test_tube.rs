@@ -159,6 +159,12 @@ impl Task for TestTube {
         }
     }
 
+    fn room(&self, sim: &Sim) -> f64 {
+        let bottom = bottom(&sim.object());
+        let out = |hole: &Hole| (bottom.z - hole.rim).max(beside(&bottom, &hole.seat()) - 4.0 * TUBE.0);
+        out(&RACK).min(out(&STAND))
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let noise = config.waypoint_noise_m;
         let stand = Stand {

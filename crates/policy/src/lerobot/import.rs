@@ -180,6 +180,7 @@ fn network(d: &Description, features: &Features, problems: &mut Vec<Obstacle>) -
         keypoints: d.spatial_softmax_num_keypoints,
         image_features: d.spatial_softmax_num_keypoints.saturating_mul(2),
         relative_features: false,
+        tool_frame_features: false,
         down_dims: d.down_dims.clone(),
         kernel_size: d.kernel_size,
         n_groups: d.n_groups,

@@ -184,6 +184,11 @@ impl Variant {
         )
     }
 
+    /// Distance from the peg's middle beyond which the nut's ring lies beside the peg, m.
+    pub(super) fn reach(&self) -> f64 {
+        self.ring + self.segment[0] + 2.0 * SQUARE_PEG_HALF_WIDTH
+    }
+
     /// How the nut is turned at a start of the hard task, rad.
     pub(super) fn start_yaw(&self, rng: &mut Rng) -> f64 {
         match self.yaw {

@@ -1,0 +1,102 @@
+//! Exploration in collection: nothing at the goal, something beyond, the same on any number of threads, and recorded.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot be set up should fail")]
+
+use e2h_core::{Action, ActionChunk, Direction, Kind, Observation, Origin, Policy, Rng};
+use e2h_env::{Env, EnvConfig, TaskOptions, task};
+use e2h_learn::{Collected, ExploreConfig, Progress, RunConfig, collect};
+
+/// Takes the cube in the tray and carries it to a place over the table, with no word from any network.
+struct Carry;
+
+impl Policy for Carry {
+    fn n_obs_steps(&self) -> usize {
+        1
+    }
+
+    fn act(&self, histories: &[Vec<&Observation>], _: &mut [Rng]) -> e2h_core::Result<Vec<ActionChunk>> {
+        let act = |history: &Vec<&Observation>| {
+            let s = history[0].state;
+            let there = (0..2).all(|i| (s[i] - s[7 + i]).abs() < 0.004) && s[2] - s[9] < 0.012;
+            let closed = s[14] < 0.06;
+            let goal = if closed && s[9] > 0.045 {
+                [0.52, -0.10, 0.20]
+            } else if closed {
+                [s[0], s[1], 0.20]
+            } else {
+                [s[7], s[8], s[9] + 0.008]
+            };
+            let mut action: Action = [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0];
+            action[..3].copy_from_slice(&goal);
+            action[7] = f32::from(u8::from(!(there || closed)));
+            vec![action; 4]
+        };
+        Ok(histories.iter().map(act).collect())
+    }
+}
+
+/// Stays where it is.
+struct Still;
+
+impl Policy for Still {
+    fn n_obs_steps(&self) -> usize {
+        1
+    }
+
+    fn act(&self, histories: &[Vec<&Observation>], _: &mut [Rng]) -> e2h_core::Result<Vec<ActionChunk>> {
+        let act = |history: &Vec<&Observation>| {
+            let mut action: Action = [0.0; 8];
+            action[..7].copy_from_slice(&history[0].state[..7]);
+            action[7] = 1.0;
+            vec![action; 16]
+        };
+        Ok(histories.iter().map(act).collect())
+    }
+}
+
+fn collected(explore: ExploreConfig, threads: usize) -> Collected {
+    let env = EnvConfig { cameras: false, horizon_hard: 16, horizon_easy: 150, ..EnvConfig::default() };
+    let task = task("cube_pick_place", &TaskOptions::default()).unwrap();
+    let mut config = RunConfig::resolve("smoke", "cube_pick_place", &[]).unwrap().config.closed_loop;
+    (config.cycles, config.loops, config.keep_rollouts, config.explore) = (4, 2, true, explore);
+    let first = Env::new(task, &env).unwrap();
+    let envs = (0..config.loops).map(|_| first.clone_shared().unwrap()).collect();
+    let origin =
+        Origin { kind: Kind::Rollout, ..Origin::demonstration("cube_pick_place", Direction::Easy, 0, 7) };
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    pool.install(|| collect(envs, &Still, &Carry, &config, &origin, &Progress::new(true))).unwrap()
+}
+
+#[test]
+fn excursions_are_zero_at_the_goal_recorded_beyond_and_the_same_on_any_threads() {
+    let explore = ExploreConfig { enabled: true, share: 0.5, ..ExploreConfig::default() };
+    let one = collected(explore.clone(), 1);
+    let several = collected(explore, 4);
+    assert_eq!(one.rejected, several.rejected);
+    assert_eq!((one.explored.cycles, one.plain.cycles), (2, 2));
+    // Each hard rollout fails, and each easy one ends over the table.
+    assert_eq!((one.explored.resets, one.plain.resets), (4, 4));
+
+    let plain = collected(ExploreConfig::default(), 2);
+    for (with, without) in one.rejected.iter().zip(&plain.rejected) {
+        let explores = with.origin.episode % 2 == 1;
+        let moved = |t: usize| {
+            (0..3).map(|i| (with.state[t][7 + i] - with.state[0][7 + i]).powi(2)).sum::<f32>().sqrt()
+        };
+        let displaced = |t: usize| with.excursion[t].iter().any(|v| *v != 0.0);
+        assert!((0..with.len()).all(|t| !displaced(t) || moved(t) > 0.045));
+        assert_eq!((0..with.len()).any(displaced), explores, "cycle {}", with.origin.episode);
+        assert!(without.excursion.iter().flatten().all(|v| *v == 0.0));
+        if explores {
+            // The hand is off the place that the policy asks for by what is recorded, less the lag of a step.
+            let t = with.len() - 1;
+            for (i, goal) in [0.52, -0.10, 0.20].iter().enumerate() {
+                let off = with.state[t][i] - goal;
+                assert!((off - with.excursion[t][i]).abs() < 0.005, "{off} {:?}", with.excursion[t]);
+            }
+            assert_ne!(with.state[t], without.state[t]);
+        } else {
+            assert_eq!(with, without);
+        }
+    }
+}

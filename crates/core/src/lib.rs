@@ -14,12 +14,14 @@
 //! ```
 
 mod episode;
+mod failure;
 mod pose;
 mod random;
 mod spelling;
 mod traits;
 
 pub use episode::{Action, Direction, Episode, Frames, Image, Kind, Observation, Origin, Outcome, State};
+pub use failure::Failure;
 pub use pose::{Pose, align_hemisphere};
 pub use random::{Rng, stream};
 pub use spelling::{nearest, one_line};

@@ -7,7 +7,7 @@ mod measure;
 
 use crate::collect::{Collected, collect};
 use crate::config::{Resolved, RunConfig};
-use crate::directory::{Directory, write_atomic};
+use crate::directory::{Directory, TRAINING, write_atomic};
 use crate::picture;
 use crate::record::{Collection, Reversal};
 use crate::tensorboard::Events;
@@ -108,7 +108,10 @@ impl Run {
         let config = &resolved.config;
         let compute = Compute::open(&options.device, config.device)?;
         let task = e2h_env::task(&config.task.name, &config.task.options())?;
-        let env = Env::new(task.clone(), &config.env)?;
+        let mut env = Env::new(task.clone(), &config.env)?;
+        if !config.policy.cameras.is_empty() {
+            env.select_cameras(&config.policy.cameras)?;
+        }
         let path = options.out.clone().unwrap_or_else(|| {
             PathBuf::from(format!("runs/{}-{}-{}", options.task, options.preset, options.seed))
         });
@@ -288,7 +291,7 @@ impl Run {
         let mut trainer =
             Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?
                 .on(&self.compute)?;
-        let saved = self.dir.join(format!("{place}/training.safetensors"));
+        let saved = self.dir.join(format!("{place}/{TRAINING}"));
         if saved.exists() {
             trainer.restore(&saved)?;
         }
@@ -494,7 +497,12 @@ impl Run {
                 .flat_map(|k| &k.segments)
                 .map(|segment| critic.evaluate(segment))
                 .collect::<std::result::Result<Vec<_>, _>>()?;
-            critic_filter(kinematic, &values, &r.suffix, &r.advantage)?
+            let suffix = r.suffix.trusting(successes);
+            if suffix.enabled != r.suffix.enabled {
+                let needed = r.suffix.min_successes;
+                notes.push(format!("suffix: not cut, the critic has seen {successes} successes of {needed}"));
+            }
+            critic_filter(kinematic, &values, &suffix, &r.advantage)?
         };
         let critic_minutes = clock.elapsed().as_secs_f64() / 60.0;
 
@@ -554,13 +562,18 @@ fn goal_note(goal: &Goal, hard: &[Episode], kept: usize, of: usize) -> String {
     )
 }
 
+/// More threads than that no machine has cores for.
+const MOST_THREADS: usize = 1024;
+
 /// Sets how many threads compute; never changes a result. A pool that is already running stays as it is.
 ///
 /// # Errors
-/// When asked for none.
+/// When asked for none, or for more than any machine has.
 pub fn set_threads(threads: usize) -> Result<()> {
-    if threads == 0 {
-        return Err(Error::Config("threads: expected at least 1, got 0".to_owned()));
+    if !(1..=MOST_THREADS).contains(&threads) {
+        return Err(Error::Config(format!(
+            "threads: expected at least 1 and at most {MOST_THREADS}, got {threads}"
+        )));
     }
     drop(rayon::ThreadPoolBuilder::new().num_threads(threads).build_global());
     Ok(())

@@ -88,17 +88,9 @@ impl Trainer {
         seed: u64,
         purpose: &str,
     ) -> Result<Self> {
-        if train.conditions == 0 || train.noises == 0 {
-            return Err(Error::Config(format!(
-                "conditions and noises: expected at least 1, got {} and {}",
-                train.conditions, train.noises
-            )));
-        }
-        if !(train.keypoint_sharpness.is_finite() && train.keypoint_sharpness > 0.0) {
-            return Err(Error::Config(format!(
-                "keypoint_sharpness: expected more than 0, got {}",
-                train.keypoint_sharpness
-            )));
+        let problems = train.validate();
+        if !problems.is_empty() {
+            return Err(Error::Config(problems.join("; ")));
         }
         let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
         if let Some(weights) = start {
@@ -189,21 +181,17 @@ impl Trainer {
                 Some((t.observation_noise, rng)),
             );
             if c.n_image_steps > 0 {
-                for camera in 0..c.cameras.len() {
+                for (camera, name) in c.cameras.iter().enumerate() {
                     let corner = c.random_crop(rng);
-                    let frames =
-                        episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
-                            Error::Data(format!(
-                                "expected images of {0} x {0} from {1:?}, found {2:?}",
-                                c.image_size,
-                                c.cameras,
-                                episode
-                                    .frames
-                                    .iter()
-                                    .map(|f| (&f.camera, f.height, f.width))
-                                    .collect::<Vec<_>>()
-                            ))
-                        })?;
+                    let named = episode.frames.iter().find(|f| f.camera == *name);
+                    let frames = named.filter(|f| f.height == c.image_size).ok_or_else(|| {
+                        Error::Data(format!(
+                            "expected images of {0} x {0} from {1:?}, found {2:?}",
+                            c.image_size,
+                            c.cameras,
+                            episode.frames.iter().map(|f| (&f.camera, f.height, f.width)).collect::<Vec<_>>()
+                        ))
+                    })?;
                     for &row in &window.observations[first_image..] {
                         host.push_image(camera, frames.image(row), corner, c.crop_size, None);
                     }

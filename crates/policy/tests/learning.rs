@@ -6,7 +6,7 @@ use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_policy::{
     Checkpoint, CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind,
-    TrainConfig, Trainer, TrainingData, train_critic,
+    ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ fn train_config() -> TrainConfig {
         conditioning_dropout: 0.0,
         observation_noise: 0.0,
         keypoint_sharpness: 1.0,
-        adam: e2h_nn::AdamConfig { clip_norm: Some(1.0), ..Default::default() },
+        adam: ScheduledAdam { clip_norm: Some(1.0), ..Default::default() },
         schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 2e-3, warmup: 10 },
         ema: e2h_nn::EmaConfig::default(),
     }

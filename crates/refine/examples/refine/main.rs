@@ -190,10 +190,8 @@ fn cameras(a: &Arguments, info: &Info) -> Result<Vec<(String, Feature)>> {
     let find = |name: &String| {
         all.iter().find(|(n, _)| n == name).cloned().with_context(|| {
             let names = all.iter().map(|(n, _)| n.as_str());
-            format!(
-                "--camera {name}: no such column, perhaps `{}`",
-                e2h_core::nearest(name, names).unwrap_or_default()
-            )
+            let perhaps = e2h_core::nearest(name, names).map(|n| format!(", perhaps `{n}`"));
+            format!("--camera {name}: no such column{}", perhaps.unwrap_or_default())
         })
     };
     a.camera.iter().map(find).collect()

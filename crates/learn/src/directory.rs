@@ -22,6 +22,8 @@ const NOTES: &str = "notes.json";
 pub(crate) const TRAINING: &str = "training.safetensors";
 /// Ends the name of a dataset that is being written.
 const UNFINISHED: &str = ".unfinished";
+/// Begin the names of files on their way to their place, of this crate and of e2h-data.
+const TEMPORARY: [&str; 2] = [".tmp", ".new-"];
 /// Folders below a run's that it writes into: `iteration_NN/segments/data/chunk-000`, and one more.
 const DEEPEST: usize = 5;
 
@@ -77,7 +79,7 @@ fn sweep(folder: &Path, depth: usize) -> Result<()> {
         let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
         let Ok(kind) = entry.file_type() else { continue };
         let done = || folder.join("notes.json").exists();
-        if kind.is_file() && (name.starts_with(".tmp") || (name == TRAINING && done())) {
+        if kind.is_file() && (TEMPORARY.iter().any(|p| name.starts_with(p)) || (name == TRAINING && done())) {
             std::fs::remove_file(&path).map_err(io("removing", &path))?;
         } else if kind.is_dir() && name.ends_with(UNFINISHED) {
             std::fs::remove_dir_all(&path).map_err(io("removing", &path))?;

@@ -141,7 +141,7 @@ fn a_checkpoint_of_impossible_numbers_is_refused() {
     assert!(refusal(dims, "\"down_dims\":[1048576,1048576]").contains("of another shape"));
     assert!(refusal(dims, "\"down_dims\":[72057594037927936]").contains("1 to 16 sizes"));
     assert!(refusal("\"horizon\":16", "\"horizon\":1152921504606846976").contains("horizon"));
-    assert!(refusal("\"guidance\":1.0", "\"guidance\":1e39").contains("guidance: expected a number"));
+    assert!(refusal("\"guidance\":1.0", "\"guidance\":1e39").contains("guidance: expected 0 to 100"));
     let range = "\"state_max\":[1.0,";
     assert!(refusal(range, "\"state_max\":[-1.0,").contains("state entry 0: expected finite ends"));
     assert!(refusal(range, "\"state_max\":[1e39,").contains("state entry 0"));

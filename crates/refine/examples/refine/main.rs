@@ -30,6 +30,7 @@ use std::path::PathBuf;
 
 /// Reverses and filters a dataset of easy-direction episodes.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// LeRobotDataset v3.0 with episodes of the easy task.
     #[arg(long, value_name = "DIR")]
@@ -92,7 +93,11 @@ struct Plan {
     account: Account,
 }
 
-fn main() -> Result<()> {
+fn main() -> Result<(), e2h_core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> Result<()> {
     let a = Arguments::parse();
     let dataset = Dataset::open(&a.dataset)?;
     let columns = columns(&a)?;

@@ -130,7 +130,7 @@ impl DemonstratorConfig {
         ] {
             range(&mut problems, name, value, bounds);
         }
-        whole(&mut problems, "tail", self.tail, [0, 1000]);
+        whole(&mut problems, "tail", self.tail, [1, 1000]);
         problems
     }
 }

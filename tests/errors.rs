@@ -82,6 +82,13 @@ fn a_run_directory_is_never_overwritten() {
     std::fs::write(policy.join("policy.json"), json.replace("\"format\": 1", "\"format\": 99")).unwrap();
     fails(&mut evaluate(&policy), &["expected format 1", "found 99"]);
     std::fs::write(policy.join("policy.json"), &json).unwrap();
+    // A digit of the normaliser, in a file that is otherwise whole.
+    let at =
+        json.find("state_min").unwrap() + json[json.find("state_min").unwrap()..].find("0.").unwrap() + 2;
+    let digit = if json.as_bytes()[at] == b'3' { "4" } else { "3" };
+    std::fs::write(policy.join("policy.json"), format!("{}{digit}{}", &json[..at], &json[at + 1..])).unwrap();
+    fails(&mut nut_assembly(&out, &["--resume", "--set=loop.iterations=0"]), &["policy.json", "SHA-256"]);
+    std::fs::write(policy.join("policy.json"), &json).unwrap();
     let weights = policy.join("model.safetensors");
     let mut bytes = std::fs::read(&weights).unwrap();
     let last = bytes.len() - 1;

@@ -6,6 +6,7 @@ use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 use std::borrow::Borrow;
 use std::fs::{File, TryLockError};
 use std::io::{Read as _, Write as _};
@@ -210,6 +211,24 @@ impl Directory {
 
     pub(crate) fn join(&self, name: impl AsRef<Path>) -> PathBuf {
         self.path.join(name)
+    }
+
+    /// SHA-256 of a file, to verify it with when it is read again.
+    pub(crate) fn sha256(&self, name: &str) -> Result<String> {
+        let path = self.join(name);
+        let bytes = std::fs::read(&path).map_err(io("reading", &path))?;
+        Ok(Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect())
+    }
+
+    /// Refuses a file that is not the one that was written; without a checksum any is taken.
+    pub(crate) fn verify(&self, name: &str, sha256: Option<&str>) -> Result<()> {
+        let Some(expected) = sha256 else { return Ok(()) };
+        let found = self.sha256(name)?;
+        if found == expected {
+            return Ok(());
+        }
+        let (path, expected) = (self.join(name), e2h_core::one_line(expected));
+        Err(Error::Foreign { path, quantity: "SHA-256".to_owned(), expected, found })
     }
 
     /// Writes `value` as JSON.

@@ -91,6 +91,9 @@ struct AcceptedNotes {
 struct TrainNotes {
     minutes: f64,
     loss: f64,
+    /// Of `policy.json`, which has that of the weights. Runs of version 0.1 have none.
+    #[serde(default)]
+    policy_sha256: Option<String>,
 }
 
 impl Run {
@@ -280,7 +283,9 @@ impl Run {
     ) -> Result<DiffusionPolicy> {
         let c = self.config();
         let notes_file = format!("{place}/notes.json");
-        if self.dir.get::<TrainNotes>(&notes_file)?.is_some() {
+        let description = format!("{place}/policy.json");
+        if let Some(notes) = self.dir.get::<TrainNotes>(&notes_file)? {
+            self.dir.verify(&description, notes.policy_sha256.as_deref())?;
             return Ok(DiffusionPolicy::load(&self.dir.join(place))?.0.on(&self.compute)?);
         }
         let clock = Instant::now();
@@ -336,7 +341,10 @@ impl Run {
             DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?.on(&self.compute)?;
         policy.save(&self.dir.join(place), &self.provenance(direction, iteration)?)?;
         let minutes = clock.elapsed().as_secs_f64() / 60.0;
-        self.dir.put(&notes_file, &TrainNotes { minutes, loss })?;
+        self.dir.put(
+            &notes_file,
+            &TrainNotes { minutes, loss, policy_sha256: Some(self.dir.sha256(&description)?) },
+        )?;
         if saved.exists() {
             std::fs::remove_file(&saved).map_err(crate::directory::io("removing", &saved))?;
         }

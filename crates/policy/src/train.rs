@@ -9,6 +9,8 @@ use e2h_nn::{
     Adam, Compute, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows,
 };
 use rand::Rng as _;
+use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -58,6 +60,25 @@ impl<'a> TrainingData<'a> {
             })
             .collect()
     }
+}
+
+/// Where a training state's header has its checksum.
+const SEAL: &str = "sha256";
+
+/// SHA-256 of names, shapes and numbers.
+fn digest(weights: &Weights) -> String {
+    let mut hasher = Sha256::new();
+    for (name, tensor) in weights {
+        hasher.update((name.len() as u64).to_le_bytes());
+        hasher.update(name);
+        for size in std::iter::once(&tensor.shape.len()).chain(&tensor.shape) {
+            hasher.update((*size as u64).to_le_bytes());
+        }
+        for value in &tensor.data {
+            hasher.update(value.to_le_bytes());
+        }
+    }
+    hasher.finalize().iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// A policy in training: network, optimiser, average of the weights, step counter.
@@ -258,15 +279,27 @@ impl Trainer {
             all.extend(tensors.into_iter().map(|(name, t)| (format!("{part}/{name}"), t)));
         }
         all.insert("step".to_owned(), HostTensor { shape: vec![1], data: vec![self.step as f32] });
-        Ok(e2h_nn::save_weights(path, &all, &std::collections::BTreeMap::new())?)
+        let seal = BTreeMap::from([(SEAL.to_owned(), digest(&all))]);
+        Ok(e2h_nn::save_weights(path, &all, &seal)?)
     }
 
     /// Continues from a file that [`Trainer::save`] wrote.
     ///
     /// # Errors
-    /// When the file is missing or of another network.
+    /// When the file is missing, damaged or of another network.
     pub fn restore(&mut self, path: &Path) -> Result<()> {
-        let (mut all, _) = e2h_nn::load_weights(path)?;
+        let (mut all, metadata) = e2h_nn::load_weights(path)?;
+        // States of version 0.1 have none.
+        if let Some(expected) = metadata.get(SEAL) {
+            let found = digest(&all);
+            if *expected != found {
+                let problem = format!(
+                    "damaged: expected SHA-256 {}, found {found}; remove the file to train this stage from its beginning",
+                    e2h_core::one_line(expected)
+                );
+                return Err(Error::Checkpoint { path: path.to_owned(), problem });
+            }
+        }
         let step = all.remove("step").and_then(|t| t.data.first().copied());
         let step = step.ok_or_else(|| Error::Checkpoint {
             path: path.to_owned(),

@@ -180,6 +180,17 @@ fn training_goes_on_from_a_saved_state_with_the_same_bytes() {
         second.step(&data).unwrap();
     }
     assert_eq!(whole.weights().unwrap(), second.weights().unwrap());
+
+    // One bit of one number.
+    let mut bytes = std::fs::read(&path).unwrap();
+    let last = bytes.len() - 9;
+    bytes[last] ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+    let message = new().restore(&path).unwrap_err().to_string();
+    assert!(
+        message.contains("damaged: expected SHA-256") && message.contains("training.safetensors"),
+        "{message}"
+    );
 }
 
 #[test]

@@ -256,9 +256,9 @@ impl RunConfig {
 
     fn from_table(preset: &str, table: Table) -> Result<Resolved> {
         let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
-        let config: Self = Value::Table(table)
-            .try_into()
-            .map_err(|e: toml::de::Error| Error::Config(e.to_string().trim().replace('\n', " ")))?;
+        let config: Self = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
+            Error::Config(e2h_core::one_line(&e.to_string().trim().replace('\n', " ")))
+        })?;
         config.validate()?;
         Ok(Resolved { preset: preset.to_owned(), config, text })
     }

@@ -66,8 +66,9 @@ fn absurd_values_are_refused_for_every_key_of_every_preset() {
                     Ok(_) => passed.push(format!("{preset}: {set}")),
                     Err(e) => {
                         let (text, last) = (e.to_string(), key.rsplit('.').next().unwrap());
-                        assert!(text.contains(last), "{set}: {text}");
-                        assert!(!text.contains(char::is_control), "{set}: {text:?}");
+                        if !text.contains(last) || text.contains(char::is_control) {
+                            passed.push(format!("{set}: not told by name: {text:?}"));
+                        }
                     }
                 }
             }
@@ -118,9 +119,11 @@ const BASE: &[&str] = &[
     "task.demonstrator.pause_probability=1.0",
     "task.demonstrator.slow_probability=1.0",
     "env.image_size=24",
+    "env.horizon_easy=500",
     "loop.demonstrations=1",
     "loop.loops=1",
     "loop.after_failure=continue",
+    "loop.keep_rollouts=true", // so that easy rollouts that fail are seen
     "policy.image_size=24",
     "policy.crop_size=20",
     "policy.n_action_steps=8",
@@ -148,22 +151,22 @@ const CHANGES: &[Change] = &[
     ("task.demonstrator.waypoint_noise_m", Ok((Demonstrate, "0.01"))),
     ("task.demonstrator.waypoint_noise_rad", Ok((Demonstrate, "0.1"))),
     ("task.demonstrator.bow", Ok((Demonstrate, "0.2"))),
-    ("task.demonstrator.speed", Ok((Demonstrate, "[0.2, 0.22]"))),
+    ("task.demonstrator.speed", Ok((Demonstrate, "[0.2,0.22]"))),
     ("task.demonstrator.acceleration", Ok((Demonstrate, "1.0"))),
     ("task.demonstrator.pause_probability", Ok((Demonstrate, "0.0"))),
-    ("task.demonstrator.pause_s", Ok((Demonstrate, "[0.1, 0.2]"))),
+    ("task.demonstrator.pause_s", Ok((Demonstrate, "[0.1,0.2]"))),
     ("task.demonstrator.slow_probability", Ok((Demonstrate, "0.0"))),
-    ("task.demonstrator.slow_speed", Ok((Demonstrate, "[0.06, 0.07]"))),
-    ("task.demonstrator.slow_length_m", Ok((Demonstrate, "[0.01, 0.02]"))),
-    ("task.demonstrator.grip_dwell_s", Ok((Demonstrate, "[0.3, 0.35]"))),
+    ("task.demonstrator.slow_speed", Ok((Demonstrate, "[0.06,0.07]"))),
+    ("task.demonstrator.slow_length_m", Ok((Demonstrate, "[0.01,0.02]"))),
+    ("task.demonstrator.grip_dwell_s", Ok((Demonstrate, "[0.3,0.35]"))),
     ("task.demonstrator.tail", Ok((Demonstrate, "12"))),
     ("env.image_size", Ok((Demonstrate, "26 policy.image_size=26"))),
     ("env.cameras", Ok((Demonstrate, "false policy.cameras=[]"))),
     ("env.horizon_hard", Ok((Collect, "40"))),
-    ("env.horizon_easy", Ok((Collect, "290"))),
+    ("env.horizon_easy", Ok((Collect, "200"))),
     ("env.hold_steps", Ok((Demonstrate, "48"))),
     ("env.max_goal_step_m", Ok((Demonstrate, "0.004"))),
-    ("env.max_goal_step_rad", Ok((Demonstrate, "0.005"))),
+    ("env.max_goal_step_rad", Ok((Demonstrate, "0.0002"))),
     ("env.home_noise_rad", Ok((Demonstrate, "0.02"))),
     ("loop.demonstrations", Ok((Demonstrate, "2"))),
     ("loop.iterations", Ok((Length, "2"))),
@@ -175,7 +178,7 @@ const CHANGES: &[Change] = &[
     ("loop.base_share", Ok((Update, "0.1"))),
     ("loop.refine_demonstrations", Ok((Demonstrate, "true"))),
     ("loop.refine_easy_demonstrations", Ok((Demonstrate, "false"))),
-    ("loop.keep_rollouts", Ok((Collect, "true"))),
+    ("loop.keep_rollouts", Ok((Collect, "false"))),
     ("policy.n_obs_steps", Ok((Train, "1"))),
     ("policy.n_image_steps", Ok((Train, "2"))),
     ("policy.horizon", Ok((Train, "18"))),
@@ -226,7 +229,7 @@ const CHANGES: &[Change] = &[
     ("refine.kinematic_enabled", Ok((Refine, "false"))),
     ("refine.reverse.lookahead", Ok((Refine, "2"))),
     ("refine.reverse.open_width_m", Ok((Refine, "0.2"))),
-    ("refine.reverse.open_at", Ok((Refine, "0.999"))),
+    ("refine.reverse.open_at", Ok((Refine, "0.851"))),
     ("refine.reverse.close_at", Ok((Refine, "0.05"))),
     ("refine.reverse.reference_quaternion", Ok((Refine, "[0.0,-1.0,0.0,0.0]"))),
     ("refine.kinematic.static_speed", Ok((Refine, "0.01"))),
@@ -307,9 +310,9 @@ fn copy(from: &Path, to: &Path) {
     for entry in std::fs::read_dir(from).unwrap().flatten() {
         let to = to.join(entry.file_name());
         if entry.path().is_dir() {
-            copy(&entry.path(), &to)
+            copy(&entry.path(), &to);
         } else {
-            drop(std::fs::copy(entry.path(), to).unwrap())
+            std::fs::copy(entry.path(), to).unwrap();
         }
     }
 }
@@ -413,6 +416,7 @@ fn observe(stage: Stage, change: &str, given: Option<&Given>) -> String {
         }
         Collect => print(&run.collect(1, &given.hard, &given.easy).unwrap()).to_string(),
         Evaluate => {
+            std::fs::create_dir_all(out.join("iteration_00")).unwrap();
             let record = run.evaluate(0, &given.hard, None).unwrap();
             let film = std::fs::read(out.join("iteration_00/rollouts.png")).ok();
             format!("{} {}", record.evaluation.trials, print(&film))

@@ -331,12 +331,12 @@ impl PolicyConfig {
                 format!("crop_size: expected 1 to image_size ({}), got {}", self.image_size, self.crop_size),
             );
             check(
-                self.encoder_width > 0 && self.encoder_width.is_multiple_of(16),
-                format!("encoder_width: expected a multiple of 16, got {}", self.encoder_width),
+                (16..=1 << 16).contains(&self.encoder_width) && self.encoder_width.is_multiple_of(16),
+                format!("encoder_width: expected a multiple of 16 up to 65536, got {}", self.encoder_width),
             );
             check(
-                !self.encoder_blocks.is_empty() && !self.encoder_blocks.contains(&0),
-                format!("encoder_blocks: expected at least one block a stage, got {:?}", self.encoder_blocks),
+                !self.encoder_blocks.is_empty() && self.encoder_blocks.iter().all(|n| (1..=64).contains(n)),
+                format!("encoder_blocks: expected 1 to 64 blocks a stage, got {:?}", self.encoder_blocks),
             );
         }
         if problems.is_empty() { Ok(()) } else { Err(Error::Config(problems.join("; "))) }
@@ -480,7 +480,7 @@ impl From<WrittenAdam> for ScheduledAdam {
 
 /// A clip of 0 in a file means none: TOML has no way to say so.
 pub(crate) fn without_zero_clip(adam: AdamConfig) -> AdamConfig {
-    AdamConfig { clip_norm: adam.clip_norm.filter(|&c| c > 0.0), ..adam }
+    AdamConfig { clip_norm: adam.clip_norm.filter(|&c| c != 0.0), ..adam }
 }
 
 /// Shape of the learning rate.

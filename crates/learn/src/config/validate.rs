@@ -70,7 +70,10 @@ impl RunConfig {
         // Its settings are told above, with their keys.
         let options = TaskOptions { demonstrator: DemonstratorConfig::default(), ..self.task.options() };
         if let Err(e) = e2h_env::task(&self.task.name, &options) {
-            all.0.push(format!("task: {e}"));
+            all.0.push(format!(
+                "task.name, task.variant or task.clearance: {}",
+                e2h_core::one_line(&e.to_string())
+            ));
         }
     }
 

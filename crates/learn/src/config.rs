@@ -236,14 +236,13 @@ impl RunConfig {
                 merge(&mut table, &layer, "")?;
             }
         }
-        let resolved = Self::from_table(preset, table)?;
-        let found = &resolved.config.task.name;
+        let found = table.get("task").and_then(|t| t.get("name")).and_then(Value::as_str).unwrap_or_default();
         if found != task {
-            return Err(Error::Config(format!(
-                "task.name: expected `{task}`, got `{found}`; each pair has its own program"
-            )));
+            let found = e2h_core::one_line(found);
+            let text = format!("task.name: expected `{task}`, got `{found}`; each pair has its own program");
+            return Err(Error::Config(text));
         }
-        Ok(resolved)
+        Self::from_table(preset, table)
     }
 
     /// Reads a resolved configuration that a run wrote.

@@ -129,7 +129,8 @@ pub fn evaluate(
             bar.set(done().count() as u64, &format!("{k} succeeded"));
         },
     )?;
-    let (mut done, mut envs): (Vec<(usize, Trial, Option<Film>)>, Vec<Env>) = (vec![], vec![]);
+    let mut done: Vec<(usize, Trial, Option<Film>)> = vec![];
+    let mut envs: Vec<Env> = vec![];
     for lane in lanes {
         done.extend(lane.state.done);
         envs.push(lane.env);

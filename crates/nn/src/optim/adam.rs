@@ -42,16 +42,18 @@ impl Default for AdamConfig {
 }
 
 impl AdamConfig {
-    /// Largest rate and weight decay that are taken for one: either moves a weight by more than weights ever are.
-    pub const LARGEST: f32 = 10.0;
+    /// Largest weight decay that is taken for one.
+    const MOST_DECAY: f32 = 10.0;
+    /// Largest rate that is taken for one: beyond it a single step leaves what `f32` can multiply.
+    const MOST_RATE: f32 = 1e12;
 
     /// # Errors
     /// [`Error::Config`] names the first setting that does not work.
     pub fn validate(&self) -> Result<()> {
         let fail =
             |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
-        if !(self.lr > 0.0 && self.lr <= Self::LARGEST) {
-            return fail("lr", "more than 0 and at most 10", self.lr);
+        if !(self.lr > 0.0 && self.lr <= Self::MOST_RATE) {
+            return fail("lr", "more than 0 and at most 1e12", self.lr);
         }
         for (what, beta) in [("beta1", self.beta1), ("beta2", self.beta2)] {
             if !(0.0..1.0).contains(&beta) {
@@ -62,7 +64,7 @@ impl AdamConfig {
         if !(self.eps > 0.0 && self.eps <= 1.0) {
             return fail("eps", "more than 0 and at most 1", self.eps);
         }
-        if !(0.0..=Self::LARGEST).contains(&self.weight_decay) {
+        if !(0.0..=Self::MOST_DECAY).contains(&self.weight_decay) {
             return fail("weight_decay", "a number from 0 to 10", self.weight_decay);
         }
         if let Some(max) = self.clip_norm.filter(|c| !(*c > 0.0 && *c <= 1e9)) {

@@ -147,7 +147,7 @@ fn a_loss_that_is_no_number_stops_the_run_with_step_and_seed() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("run");
     let arguments = [
-        "--set=train.step.schedule.lr=1e10",
+        "--set=train.step.schedule.lr=1e30",
         "--set=train.step.schedule.warmup=0",
         "--set=train.step.adam.clip_norm=0.0",
     ];

@@ -36,6 +36,8 @@ fn absurd(key: &str, value: &Value) -> Vec<String> {
         // Any number that is not negative is a seed.
         Value::Integer(_) if key == "evaluation.seed" => list(&["-1"]),
         Value::Integer(_) => list(&["-1", "4000000000", "9223372036854775807"]),
+        // What is too large a rate depends on all else; a loss that is no number tells it.
+        Value::Float(_) if key.ends_with(".lr") => list(&["nan", "inf", "0.0", "-1e30"]),
         Value::Float(_) => list(&["nan", "inf", "1e30", "-1e30"]),
         Value::String(_) => list(&["no_such_thing", "\u{1b}[2J"]),
         Value::Boolean(_) => list(&["2"]),

@@ -44,16 +44,14 @@ impl Default for AdamConfig {
 impl AdamConfig {
     /// Largest weight decay that is taken for one.
     const MOST_DECAY: f32 = 10.0;
-    /// Largest rate that is taken for one: beyond it a single step leaves what `f32` can multiply.
-    const MOST_RATE: f32 = 1e12;
 
     /// # Errors
     /// [`Error::Config`] names the first setting that does not work.
     pub fn validate(&self) -> Result<()> {
         let fail =
             |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
-        if !(self.lr > 0.0 && self.lr <= Self::MOST_RATE) {
-            return fail("lr", "more than 0 and at most 1e12", self.lr);
+        if !(self.lr > 0.0 && self.lr.is_finite()) {
+            return fail("lr", "a finite number more than 0", self.lr);
         }
         for (what, beta) in [("beta1", self.beta1), ("beta2", self.beta2)] {
             if !(0.0..1.0).contains(&beta) {

@@ -10,10 +10,11 @@
 
 mod common;
 
+use auto_e2h::core::Failure;
 use auto_e2h::learn::{Run, report};
 use std::time::Instant;
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), Failure> {
     let run = Run::open(&common::options("disk")?)?;
 
     // Line 1: easy demonstrations, their reversal, and a policy from each.

@@ -15,6 +15,7 @@ use std::time::Instant;
 
 /// Replays a demonstration over and over and counts control steps.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Task pair.
     #[arg(long, default_value = "nut_assembly")]
@@ -57,7 +58,11 @@ fn run(env: &mut Env, actions: &[Action], steps: usize) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
     if a.steps == 0 || a.threads == 0 {
         bail!("--steps and --threads: expected at least 1, got {} and {}", a.steps, a.threads);

@@ -6,13 +6,15 @@
 
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
-use auto_e2h::learn::{Filming, Progress, Published, evaluate, hub, report};
+use anyhow::{Context as _, ensure};
+use auto_e2h::learn::{Filmed, Filming, Progress, Published, evaluate, hub, report};
 use auto_e2h::nn::Compute;
 use clap::Parser;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Runs a policy from fresh resets and counts successes.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Folder with policy.json and model.safetensors, or hf://OWNER/NAME[@revision] (feature `hub`).
     #[arg(long, value_name = "DIR")]
@@ -26,7 +28,7 @@ struct Arguments {
     /// Print one JSON line and nothing else.
     #[arg(long)]
     json: bool,
-    /// Write an animation (APNG) of the first trials, failures first.
+    /// Write an animation (a .png or .apng that plays) of trials, failures first.
     #[arg(long, value_name = "FILE")]
     video: Option<PathBuf>,
     /// Trials in the animation.
@@ -40,8 +42,16 @@ struct Arguments {
     threads: Option<usize>,
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
+    if let Some(path) = &a.video {
+        ensure!(a.filmed > 0, "--filmed: expected at least 1 trial for --video, got 0");
+        check_video(path).with_context(|| format!("--video {}", path.display()))?;
+    }
     if let Some(n) = a.threads {
         auto_e2h::learn::set_threads(n)?;
     }
@@ -51,19 +61,13 @@ fn main() -> anyhow::Result<()> {
     let parallel = published.config.evaluation.parallel.min(a.trials);
     let progress = Progress::new(a.json);
     let (policy, direction) = (&published.policy, published.direction);
-    let run = |filming: Option<&Filming>| -> anyhow::Result<_> {
-        Ok(evaluate(published.envs(parallel)?, policy, direction, a.trials, a.seed, filming, &progress)?)
-    };
-    let done = run(None)?;
+    let filming = Filming { trials: Filmed::FailuresFirst(a.filmed), camera: "table".to_owned(), size: 200 };
+    let filming = a.video.is_some().then_some(&filming);
+    let envs = published.envs(parallel)?;
+    let done = evaluate(envs, policy, direction, a.trials, a.seed, filming, &progress)?;
     let result = &done.evaluation;
-
     if let Some(path) = &a.video {
-        let mut trials: Vec<usize> = (0..done.trials.len()).collect();
-        trials.sort_by_key(|&i| done.trials[i].outcome.is_success());
-        trials.truncate(a.filmed);
-        // The same evaluation again: which trials fail is known only after the first.
-        let filming = Filming { trials, camera: "table".to_owned(), size: 200 };
-        let (outcomes, frames): (Vec<_>, Vec<_>) = run(Some(&filming))?.films.into_iter().unzip();
+        let (outcomes, frames): (Vec<_>, Vec<_>) = done.films.into_iter().unzip();
         report::animation::write_apng(path, &report::animation::tile(&frames, &outcomes, 3), 10)?;
     }
 
@@ -87,6 +91,21 @@ fn main() -> anyhow::Result<()> {
             hi * 100.0,
             result.seconds
         );
+    }
+    Ok(())
+}
+
+/// Refuses, before any trial, a place that no animation can be written to.
+fn check_video(path: &Path) -> anyhow::Result<()> {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    ensure!(
+        ["png", "apng"].iter().any(|known| extension.eq_ignore_ascii_case(known)),
+        "expected a name that ends in .png or .apng, which is what an animation is written as, found `.{extension}`"
+    );
+    let there = path.exists();
+    std::fs::OpenOptions::new().append(true).create(true).open(path)?;
+    if !there {
+        std::fs::remove_file(path)?;
     }
     Ok(())
 }

@@ -20,6 +20,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Task pair, with a variant after a colon if not the default one (nut_assembly:square).
     #[arg(long, default_value = "nut_assembly", conflicts_with = "all")]
@@ -80,7 +81,11 @@ impl Count {
     }
 }
 
-fn main() -> Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> Result<()> {
     let arguments = Arguments::parse();
     let names: Vec<String> = match (arguments.all, arguments.variants) {
         (false, _) => vec![arguments.task.clone()],

@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 
 /// Converts diffusion policies to and from LeRobot 0.4.4.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Our checkpoint: a folder with policy.json and model.safetensors.
     #[arg(long, value_name = "DIR", requires = "lerobot", conflicts_with_all = ["from_lerobot", "out"])]
@@ -35,7 +36,11 @@ struct Arguments {
     json: bool,
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
     match (&a.checkpoint, &a.lerobot, &a.from_lerobot, &a.out) {
         (Some(from), Some(to), ..) => to_lerobot(from, to, a.json),

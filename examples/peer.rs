@@ -19,6 +19,7 @@ use workload::{Size, Workload};
 
 /// Times a training step, a forward pass and sampling.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Which network.
     #[arg(long, value_enum, default_value = "laptop")]
@@ -95,7 +96,11 @@ fn peak_mb() -> Option<u64> {
     Some(line.split_whitespace().nth(1)?.parse::<u64>().ok()? / 1024)
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
     if a.candle { candle_operations(|| measure(&a)) } else { measure(&a) }
 }

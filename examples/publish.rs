@@ -12,6 +12,7 @@ use std::path::PathBuf;
 
 /// Publishes a checkpoint folder as one commit.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Folder with policy.json and model.safetensors; of a run, its results are published too.
     dir: PathBuf,
@@ -26,7 +27,11 @@ struct Arguments {
     license: Option<String>,
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
     let publication = Publication { address: a.repo, dir: a.dir, private: a.private, license: a.license };
     println!("{}", publish(&publication, &Settings::from_env())?);

@@ -15,6 +15,7 @@ use std::time::UNIX_EPOCH;
 
 /// Writes an HTML page of every episode of a dataset or a run.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// A LeRobotDataset v3.0 or a run directory.
     dir: PathBuf,
@@ -38,7 +39,11 @@ struct Arguments {
     tensorboard: Option<PathBuf>,
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<(), auto_e2h::core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
     let out = a.out.unwrap_or_else(|| a.dir.join(VIEW_FILE));
     let options =

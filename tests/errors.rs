@@ -1,4 +1,5 @@
 use crate::{SMALL, assert_same_results, assert_success, example, nut_assembly, text};
+use std::path::Path;
 use std::process::Command;
 
 fn fails(command: &mut Command, words: &[&str]) {
@@ -25,6 +26,12 @@ fn wrong_configuration_is_refused_before_any_work() {
     let sharpness = &["--set", "train.step.keypoint_sharpness=0", "--set", "refine.goal.least=nan"];
     fails(&mut nut_assembly(&out, sharpness), &["train.step.keypoint_sharpness", "refine.goal.least", "NaN"]);
     fails(&mut nut_assembly(&out, &["--threads", "0"]), &["threads", "at least 1"]);
+    fails(&mut nut_assembly(&out, &["--iterations", "4000000000"]), &["loop.iterations", "0 to 1000"]);
+    fails(&mut nut_assembly(&out, &["--set", "task.name=disk"]), &["task.name", "nut_assembly", "disk"]);
+    fails(
+        &mut nut_assembly(&out, &["--set", "policy.cameras=[\"foo\"]"]),
+        &["policy.cameras", "wrist", "foo"],
+    );
     assert!(!out.exists(), "a refused run left a folder");
 }
 
@@ -47,6 +54,9 @@ fn a_run_directory_is_never_overwritten() {
     std::fs::create_dir(&other).unwrap();
     std::fs::write(other.join("photo.jpg"), "mine").unwrap();
     fails(&mut nut_assembly(&other, &["--resume"]), &["exists"]);
+    let nowhere = dir.path().join("nowhere");
+    fails(&mut nut_assembly(&nowhere, &["--resume"]), &["nowhere", "leave --resume out"]);
+    assert!(!nowhere.exists(), "a refused run left a folder");
 
     // Foreign and damaged checkpoints.
     let evaluate = |checkpoint: &std::path::Path| {
@@ -55,10 +65,25 @@ fn a_run_directory_is_never_overwritten() {
         command
     };
     fails(&mut evaluate(&other), &["policy.json"]);
+    let told = text(&evaluate(&other).output().unwrap().stderr);
+    assert_eq!(told.matches("No such file").count(), 1, "{told}");
+    assert_eq!(told.lines().count(), 1, "{told}");
+    for (video, words) in [("x.mp4", ".png or .apng"), ("no/such/x.png", "No such file")] {
+        let mut command = evaluate(Path::new("checkpoints/nut_assembly"));
+        fails(command.arg("--video").arg(dir.path().join(video)), &["--video", words]);
+        assert!(!dir.path().join(video).exists());
+    }
     let policy = out.join("iteration_00/policy");
     let json = std::fs::read_to_string(policy.join("policy.json")).unwrap();
     std::fs::write(policy.join("policy.json"), json.replace("\"format\": 1", "\"format\": 99")).unwrap();
     fails(&mut evaluate(&policy), &["expected format 1", "found 99"]);
+    std::fs::write(policy.join("policy.json"), &json).unwrap();
+    // A digit of the normaliser, in a file that is otherwise whole.
+    let at =
+        json.find("state_min").unwrap() + json[json.find("state_min").unwrap()..].find("0.").unwrap() + 2;
+    let digit = if json.as_bytes()[at] == b'3' { "4" } else { "3" };
+    std::fs::write(policy.join("policy.json"), format!("{}{digit}{}", &json[..at], &json[at + 1..])).unwrap();
+    fails(&mut nut_assembly(&out, &["--resume", "--set=loop.iterations=0"]), &["policy.json", "SHA-256"]);
     std::fs::write(policy.join("policy.json"), &json).unwrap();
     let weights = policy.join("model.safetensors");
     let mut bytes = std::fs::read(&weights).unwrap();
@@ -66,6 +91,35 @@ fn a_run_directory_is_never_overwritten() {
     bytes[last] ^= 1;
     std::fs::write(&weights, bytes).unwrap();
     fails(&mut evaluate(&policy), &["SHA-256"]);
+}
+
+#[test]
+fn every_program_has_a_version() {
+    for name in ["nut_assembly", "evaluate", "experts", "view", "export", "publish", "env_step", "peer"] {
+        let output = example(name).arg("--version").output().unwrap();
+        assert_success(&output);
+        assert!(text(&output.stdout).contains(env!("CARGO_PKG_VERSION")), "{name}");
+    }
+}
+
+#[test]
+fn two_processes_do_not_work_on_one_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    let mut first = nut_assembly(&out, &[]).stdout(std::process::Stdio::null()).spawn().unwrap();
+    while !out.join("run.json").exists() {
+        assert!(first.try_wait().unwrap().is_none(), "the first run ended early");
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    let named = format!("process {}", first.id());
+    fails(&mut nut_assembly(&out, &["--resume"]), &["in use", &named]);
+    first.kill().unwrap();
+    first.wait().unwrap();
+    // What the kill left is removed; the lock ended with its process.
+    std::fs::write(out.join(".tmpleft"), "x").unwrap();
+    std::fs::create_dir_all(out.join("iteration_01/segments.unfinished")).unwrap();
+    assert_success(&nut_assembly(&out, &["--resume"]).output().unwrap());
+    assert!(!out.join(".tmpleft").exists() && !out.join("iteration_01/segments.unfinished").exists());
 }
 
 #[test]
@@ -110,15 +164,17 @@ fn a_full_disk_leaves_nothing_half_written() {
     assert_success(&nut_assembly(&whole, &[]).output().unwrap());
     let program = example("nut_assembly").get_program().to_owned();
     for kilobytes in [16, 200, 400] {
+        let resume = full.exists();
         let mut command = Command::new("bash");
         command
             .arg("-c")
             .arg(format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$@\""))
             .arg("bash")
             .arg(&program)
-            .args(["--preset", "smoke", "--quiet", "--resume", "--out"])
+            .args(["--preset", "smoke", "--quiet", "--out"])
             .arg(&full)
-            .args(SMALL);
+            .args(SMALL)
+            .args(resume.then_some("--resume"));
         fails(&mut command, &["File too large"]);
     }
     assert_success(&nut_assembly(&full, &["--resume"]).output().unwrap());

@@ -15,7 +15,8 @@ fn a_run_killed_at_random_instants_ends_with_the_same_bytes_whatever_the_threads
     let mut kills = 0;
     for attempt in 0..40 {
         let threads = ["1", "2", "3"][attempt % 3];
-        let mut child = nut_assembly(&killed, &["--resume", "--threads", threads])
+        let mut child = nut_assembly(&killed, &["--threads", threads])
+            .args(killed.exists().then_some("--resume"))
             .stdout(std::process::Stdio::null())
             .spawn()
             .unwrap();

@@ -16,6 +16,7 @@ enum Preset {
 
 /// Learns the hard task of a pair from reversed demonstrations of the easy one.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Sizes and step counts to run with.
     #[arg(long, value_enum, default_value = "laptop")]

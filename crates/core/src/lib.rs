@@ -14,6 +14,7 @@
 //! ```
 
 mod episode;
+mod failure;
 mod pose;
 mod random;
 mod spelling;
@@ -22,6 +23,7 @@ mod traits;
 pub use episode::{
     Action, Direction, Episode, Excursion, Frames, Image, Kind, Observation, Origin, Outcome, State,
 };
+pub use failure::Failure;
 pub use pose::{Pose, align_hemisphere};
 pub use random::{Rng, stream};
 pub use spelling::{nearest, one_line};

@@ -1,11 +1,24 @@
-/// The candidate with the fewest edits from `name`: what an answer to a misspelt name suggests.
+/// What an answer to a misspelt name suggests: a candidate that the name abbreviates, or the one with the fewest edits from
+/// it; none where so many letters differ that it would be a guess.
 ///
 /// ```
 /// assert_eq!(e2h_core::nearest("lapto", ["smoke", "laptop", "paper"]), Some("laptop"));
+/// assert_eq!(e2h_core::nearest("nut", ["nut_assembly", "disk"]), Some("nut_assembly"));
+/// assert_eq!(e2h_core::nearest("kettle", ["nut_assembly", "disk"]), None);
 /// ```
 #[must_use]
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
-    candidates.into_iter().min_by_key(|candidate| edits(name, candidate))
+    let candidates: Vec<&str> = candidates.into_iter().collect();
+    // A part of a name, or a name with something added, is meant as that name however many letters are missing.
+    let shared =
+        |candidate: &&&str| !name.is_empty() && (candidate.contains(name) || name.contains(**candidate));
+    let length = |candidate: &&&str| candidate.chars().count().abs_diff(name.chars().count());
+    let parts = candidates.iter().filter(shared).min_by_key(|c| (!c.starts_with(name), length(c)));
+    let (edited, distance) = candidates.iter().map(|c| (c, edits(name, c))).min_by_key(|(_, n)| *n)?;
+    let longest = edited.chars().count().max(name.chars().count());
+    let near = (2 * distance <= longest).then_some(edited);
+    // One or two letters apart is a slip of the hand, and beats a shared part.
+    if distance <= 2 { near.or(parts) } else { parts.or(near) }.copied()
 }
 
 /// Letters to insert, delete or replace between two names.

@@ -16,6 +16,7 @@ use std::process::ExitCode;
 
 /// LeRobot datasets.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -36,7 +37,11 @@ enum Command {
     },
 }
 
-fn main() -> Result<ExitCode> {
+fn main() -> Result<ExitCode, e2h_core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> Result<ExitCode> {
     let Command::Check { dir, repair: mend, json } = Arguments::parse().command;
     let report = if mend { repair(&dir)? } else { check(&dir)? };
     if json {

@@ -10,11 +10,12 @@
 use anyhow::{Context, Result};
 use clap::Parser;
 use e2h_core::{Direction, Image, stream};
-use e2h_env::{DemonstratorConfig, Env, EnvConfig, Style, TaskOptions, registry, task};
+use e2h_env::{DemonstratorConfig, Env, EnvConfig, MOST_PIXELS, Style, TaskOptions, registry, task};
 use std::path::{Path, PathBuf};
 
 /// Draws every task pair.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// Folder for one PNG a pair.
     #[arg(long, value_name = "DIR", default_value = "runs/gallery")]
@@ -23,18 +24,27 @@ struct Arguments {
     #[arg(long)]
     task: Option<String>,
     /// Side of each picture, pixels.
-    #[arg(long, default_value_t = 144)]
+    #[arg(long, default_value_t = 144, value_parser = side)]
     size: usize,
     /// Seed of the start.
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
 
+fn side(text: &str) -> Result<usize, String> {
+    let side = text.parse::<usize>().ok().filter(|side| (1..=MOST_PIXELS).contains(side));
+    side.ok_or_else(|| format!("expected 1 to {MOST_PIXELS} pixels"))
+}
+
 /// Control steps before the release, or before success where nothing is released.
 const BEFORE: usize = 16;
 const GAP: usize = 3;
 
-fn main() -> Result<()> {
+fn main() -> Result<(), e2h_core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> Result<()> {
     let arguments = Arguments::parse();
     std::fs::create_dir_all(&arguments.out).with_context(|| format!("making {}", arguments.out.display()))?;
     let names: Vec<&str> = match &arguments.task {

@@ -57,6 +57,84 @@ impl EnvConfig {
     }
 }
 
+/// Longest episode, control steps: a quarter of an hour.
+const MOST_STEPS: usize = 20_000;
+/// Largest image of an observation, pixels a side: every step of every episode keeps its images.
+const MOST_SIDE: usize = 1024;
+
+fn whole(problems: &mut Vec<String>, name: &str, value: usize, [least, most]: [usize; 2]) {
+    if !(least..=most).contains(&value) {
+        problems.push(format!("{name}: expected {least} to {most}, got {value}"));
+    }
+}
+
+fn number(problems: &mut Vec<String>, name: &str, value: f64, [least, most]: [f64; 2]) {
+    if !(least..=most).contains(&value) {
+        problems.push(format!("{name}: expected {least} to {most}, got {value}"));
+    }
+}
+
+fn range(problems: &mut Vec<String>, name: &str, [low, high]: [f64; 2], [least, most]: [f64; 2]) {
+    if !(least <= low && low <= high && high <= most) {
+        problems.push(format!("{name}: expected a range within {least} to {most}, got [{low}, {high}]"));
+    }
+}
+
+impl EnvConfig {
+    /// All problems with the values.
+    #[must_use]
+    pub fn validate(&self) -> Vec<String> {
+        let mut problems = vec![];
+        for (name, value, bounds) in [
+            ("image_size", self.image_size, [1, MOST_SIDE]),
+            ("horizon_hard", self.horizon_hard, [1, MOST_STEPS]),
+            ("horizon_easy", self.horizon_easy, [1, MOST_STEPS]),
+        ] {
+            whole(&mut problems, name, value, bounds);
+        }
+        // A success that has to be held for longer than an episode lasts is none.
+        let shortest = self.horizon_hard.min(self.horizon_easy).max(1);
+        whole(&mut problems, "hold_steps", self.hold_steps, [1, shortest]);
+        for (name, value, bounds) in [
+            ("max_goal_step_m", self.max_goal_step_m, [1e-4, 1.0]),
+            ("max_goal_step_rad", self.max_goal_step_rad, [1e-4, std::f64::consts::PI]),
+            ("home_noise_rad", self.home_noise_rad, [0.0, 1.0]),
+        ] {
+            number(&mut problems, name, value, bounds);
+        }
+        problems
+    }
+}
+
+impl DemonstratorConfig {
+    /// All problems with the values.
+    #[must_use]
+    pub fn validate(&self) -> Vec<String> {
+        let mut problems = vec![];
+        for (name, value, bounds) in [
+            ("waypoint_noise_m", self.waypoint_noise_m, [0.0, 1.0]),
+            ("waypoint_noise_rad", self.waypoint_noise_rad, [0.0, std::f64::consts::PI]),
+            ("bow", self.bow, [0.0, 1.0]),
+            ("acceleration", self.acceleration, [1e-3, 100.0]),
+            ("pause_probability", self.pause_probability, [0.0, 1.0]),
+            ("slow_probability", self.slow_probability, [0.0, 1.0]),
+        ] {
+            number(&mut problems, name, value, bounds);
+        }
+        for (name, value, bounds) in [
+            ("speed", self.speed, [1e-3, 10.0]),
+            ("pause_s", self.pause_s, [0.0, 60.0]),
+            ("slow_speed", self.slow_speed, [1e-3, 10.0]),
+            ("slow_length_m", self.slow_length_m, [0.0, 10.0]),
+            ("grip_dwell_s", self.grip_dwell_s, [0.0, 60.0]),
+        ] {
+            range(&mut problems, name, value, bounds);
+        }
+        whole(&mut problems, "tail", self.tail, [1, 1000]);
+        problems
+    }
+}
+
 /// Which form of a task, and who demonstrates it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

@@ -6,7 +6,8 @@ use e2h_core::{Action, Direction, Image, Observation, Outcome, Pose, Rng, State}
 use mujoco_rs::prelude::MjModel;
 use std::sync::Arc;
 
-const CAMERAS: [&str; 2] = ["table", "wrist"];
+/// Names of the cameras that every scene has, in the order in which observations bring them.
+pub const CAMERAS: [&str; 2] = ["table", "wrist"];
 /// Control steps that a new start gets to come to rest.
 const SETTLE: usize = 4;
 /// Control steps in which the gripper opens for certain.
@@ -36,8 +37,12 @@ impl Env {
     /// An environment of a task.
     ///
     /// # Errors
-    /// When MuJoCo refuses the scene, or the scene lacks what the environment needs.
+    /// When settings cannot work, MuJoCo refuses the scene, or the scene lacks what the environment needs.
     pub fn new(task: Arc<dyn Task>, config: &EnvConfig) -> Result<Self> {
+        let problems = config.validate();
+        if !problems.is_empty() {
+            return Err(Error::Config(problems.join("; ")));
+        }
         logging::install();
         let model = MjModel::from_xml_string(&task.scene()).map_err(|e| Error::MuJoCo(e.to_string()))?;
         Self::with_model(task, config, Arc::new(model))
@@ -48,7 +53,23 @@ impl Env {
     /// # Errors
     /// As [`Self::new`].
     pub fn clone_shared(&self) -> Result<Self> {
-        Self::with_model(self.task.clone(), &self.config, self.sim.model.clone())
+        let mut other = Self::with_model(self.task.clone(), &self.config, self.sim.model.clone())?;
+        other.cameras.clone_from(&self.cameras);
+        Ok(other)
+    }
+
+    /// From now on observations bring the images of these cameras, in this order; without [`EnvConfig::cameras`] none does.
+    ///
+    /// # Errors
+    /// An unknown camera. Nothing has changed then.
+    pub fn select_cameras(&mut self, names: &[String]) -> Result<()> {
+        if let Some(name) = names.iter().find(|n| !CAMERAS.contains(&n.as_str())) {
+            return Err(Error::Camera { name: name.clone(), known: known_cameras() });
+        }
+        if self.config.cameras {
+            self.cameras = names.to_vec();
+        }
+        Ok(())
     }
 
     fn with_model(task: Arc<dyn Task>, config: &EnvConfig, model: Arc<MjModel>) -> Result<Self> {
@@ -266,7 +287,7 @@ impl Env {
     /// A picture of any size, drawn as in observations.
     ///
     /// # Errors
-    /// An unknown camera.
+    /// An unknown camera, or sides that are not 1 to [`crate::MOST_PIXELS`].
     pub fn render(&mut self, camera: &str, width: usize, height: usize) -> Result<Image> {
         self.render_styled(camera, width, height, Style::default())
     }
@@ -274,7 +295,7 @@ impl Env {
     /// A picture of any size for a report, for example with shadows.
     ///
     /// # Errors
-    /// An unknown camera.
+    /// An unknown camera, or sides that are not 1 to [`crate::MOST_PIXELS`].
     pub fn render_styled(
         &mut self,
         camera: &str,
@@ -284,6 +305,11 @@ impl Env {
     ) -> Result<Image> {
         self.renderer.draw(&self.sim.data, camera, width, height, style)
     }
+}
+
+/// The cameras in words.
+pub(crate) fn known_cameras() -> String {
+    format!("the cameras `{}`", CAMERAS.join("` and `"))
 }
 
 /// Refuses actions before anything moves.

@@ -35,11 +35,11 @@ mod tasks;
 
 pub use arm::PosturePull;
 pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
-pub use env::Env;
+pub use env::{CAMERAS, Env};
 pub use expert::{Expert, Phase, Script};
 pub use probe::{Blind, Probed, probe};
 pub use record::{demonstrate, replay};
-pub use render::Style;
+pub use render::{MOST_PIXELS, Style};
 pub use scene::{TableCamera, compose, finer};
 pub use sim::{MAX_OPENING, Sim};
 pub use task::{Task, registry, task, variants};
@@ -50,16 +50,27 @@ pub use tasks::*;
 #[non_exhaustive]
 pub enum Error {
     /// A name that the registry does not have.
-    #[error("unknown {what} `{name}`: did you mean `{nearest}`? Known: {known}")]
+    #[error("unknown {what} `{name}`: {}known: {known}", guess(.nearest))]
     Unknown {
         /// Kind of name.
         what: &'static str,
         /// The name asked for.
         name: String,
-        /// The nearest known one.
+        /// The nearest known one; empty when none is near.
         nearest: String,
         /// All known ones.
         known: String,
+    },
+    /// Settings that cannot work; all of them.
+    #[error("environment: {0}")]
+    Config(String),
+    /// A picture without pixels, or with too many.
+    #[error("picture: expected sides of 1 to {most} pixels, got {width} x {height}", most = MOST_PIXELS)]
+    Picture {
+        /// Columns asked for.
+        width: usize,
+        /// Rows asked for.
+        height: usize,
     },
     /// MuJoCo refused something; the message is its own.
     #[error("MuJoCo: {0}")]
@@ -117,6 +128,10 @@ pub enum Error {
     /// A recording does not fit together.
     #[error(transparent)]
     Core(#[from] e2h_core::Error),
+}
+
+fn guess(nearest: &str) -> String {
+    if nearest.is_empty() { String::new() } else { format!("did you mean `{nearest}`? ") }
 }
 
 /// Shorthand for a result with this crate's [`enum@Error`].

@@ -23,6 +23,9 @@ const SUNLIGHT: f32 = 0.48;
 const SKY: V = [0.62, 0.70, 0.80];
 const FAR: f32 = 1e9;
 
+/// Longest side of a picture, pixels.
+pub const MOST_PIXELS: usize = 4096;
+
 /// Buffers that are reused from frame to frame.
 #[derive(Default)]
 pub(crate) struct Renderer {
@@ -50,7 +53,10 @@ impl Renderer {
         height: usize,
         style: Style,
     ) -> Result<Image> {
-        let eye = eye(data, camera, width as f32 / height.max(1) as f32)?;
+        if ![width, height].iter().all(|side| (1..=MOST_PIXELS).contains(side)) {
+            return Err(Error::Picture { width, height });
+        }
+        let eye = eye(data, camera, width as f32 / height as f32)?;
         self.collect(data);
         self.depth.clear();
         self.depth.resize(width * height, FAR);
@@ -136,10 +142,9 @@ fn vertical(y: usize, height: usize) -> f32 {
 
 fn eye(data: &MjData<Arc<MjModel>>, camera: &str, aspect: f32) -> Result<Eye> {
     let model = data.model();
-    let id = model.name_to_id(MjtObjBase::mjOBJ_CAMERA, camera).ok_or_else(|| Error::Camera {
-        name: camera.to_owned(),
-        known: "the cameras `table` and `wrist`".into(),
-    })?;
+    let id = model
+        .name_to_id(MjtObjBase::mjOBJ_CAMERA, camera)
+        .ok_or_else(|| Error::Camera { name: camera.to_owned(), known: crate::env::known_cameras() })?;
     let m = data.cam_xmat()[id].map(|v| v as f32);
     let tan = (model.cam_fovy()[id].to_radians() / 2.0).tan() as f32;
     Ok(Eye {

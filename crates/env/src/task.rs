@@ -121,7 +121,8 @@ pub fn variants(name: &str) -> &'static [&'static str] {
 /// A task by name.
 ///
 /// # Errors
-/// Unknown names and variants (the message has the nearest known one), and a clearance that the scene has no room for.
+/// Unknown names and variants (the message has the nearest known one), a clearance that the scene has no room for, and a
+/// demonstrator whose settings cannot work.
 pub fn task(name: &str, options: &TaskOptions) -> Result<Arc<dyn Task>> {
     let Some(entry) = ENTRIES.iter().find(|e| e.name == name) else {
         return Err(unknown("task", name, registry()));
@@ -134,6 +135,11 @@ pub fn task(name: &str, options: &TaskOptions) -> Result<Arc<dyn Task>> {
         },
     };
     let clearance = clearance(entry, options.clearance)?;
+    let problems = options.demonstrator.validate();
+    if !problems.is_empty() {
+        let problems: Vec<String> = problems.into_iter().map(|p| format!("demonstrator.{p}")).collect();
+        return Err(Error::Config(problems.join("; ")));
+    }
     Ok((entry.build)(Choice { variant, clearance, demonstrator: options.demonstrator.clone() }))
 }
 

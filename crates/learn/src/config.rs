@@ -1,5 +1,7 @@
 //! A run's configuration: preset < task file < `--set key=value`, checked before any work.
 
+mod validate;
+
 use crate::{Error, ExploreConfig, Result};
 use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
@@ -241,6 +243,12 @@ impl RunConfig {
                 merge(&mut table, &layer, "")?;
             }
         }
+        let found = table.get("task").and_then(|t| t.get("name")).and_then(Value::as_str).unwrap_or_default();
+        if found != task {
+            let found = e2h_core::one_line(found);
+            let text = format!("task.name: expected `{task}`, got `{found}`; each pair has its own program");
+            return Err(Error::Config(text));
+        }
         Self::from_table(preset, table)
     }
 
@@ -254,85 +262,48 @@ impl RunConfig {
 
     fn from_table(preset: &str, table: Table) -> Result<Resolved> {
         let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
-        let config: Self = Value::Table(table)
-            .try_into()
-            .map_err(|e: toml::de::Error| Error::Config(e.to_string().trim().replace('\n', " ")))?;
+        let config: Self = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
+            Error::Config(e2h_core::one_line(&e.to_string().trim().replace('\n', " ")))
+        })?;
         config.validate()?;
         Ok(Resolved { preset: preset.to_owned(), config, text })
-    }
-
-    fn validate(&self) -> Result<()> {
-        let mut problems = vec![];
-        let mut check = |ok: bool, text: String| {
-            if !ok {
-                problems.push(text);
-            }
-        };
-        let l = &self.closed_loop;
-        for problem in l.explore.validate(l.iterations) {
-            check(false, format!("loop.explore.{problem}"));
-        }
-        check(l.demonstrations > 0, "loop.demonstrations: expected at least 1, got 0".to_owned());
-        check(l.loops > 0, "loop.loops: expected at least 1, got 0".to_owned());
-        check(
-            (0.0..=1.0).contains(&l.base_share),
-            format!("loop.base_share: expected 0 to 1, got {}", l.base_share),
-        );
-        check(self.evaluation.trials > 0, "evaluation.trials: expected at least 1, got 0".to_owned());
-        check(self.evaluation.parallel > 0, "evaluation.parallel: expected at least 1, got 0".to_owned());
-        let sharpness = self.train.step.keypoint_sharpness;
-        check(
-            sharpness.is_finite() && sharpness > 0.0,
-            format!("train.step.keypoint_sharpness: expected more than 0, got {sharpness}"),
-        );
-        let goal = &self.refine.goal;
-        check(
-            (0.0..=100.0).contains(&goal.percentile),
-            format!("refine.goal.percentile: expected 0 to 100, got {}", goal.percentile),
-        );
-        check(
-            goal.least.is_finite() && goal.least >= 0.0,
-            format!("refine.goal.least: expected 0 or more, got {}", goal.least),
-        );
-        check(self.train.save_every > 0, "train.save_every: expected at least 1, got 0".to_owned());
-        check(
-            self.policy.cameras.is_empty() || self.env.cameras,
-            "env.cameras: expected true for a policy with cameras, got false".to_owned(),
-        );
-        check(
-            self.policy.cameras.is_empty() || self.policy.image_size == self.env.image_size,
-            format!(
-                "policy.image_size: expected env.image_size ({}), got {}",
-                self.env.image_size, self.policy.image_size
-            ),
-        );
-        if let Err(e) = self.policy.validate() {
-            problems.push(e.to_string());
-        }
-        if problems.is_empty() { Ok(()) } else { Err(Error::Config(problems.join("; "))) }
     }
 }
 
 fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str> {
     known.iter().find(|(n, _)| *n == name).map(|(_, text)| *text).ok_or_else(|| {
-        let nearest = nearest(name, known.iter().map(|(n, _)| *n)).unwrap_or_default();
-        Error::Config(format!("unknown {what} `{name}`; did you mean `{nearest}`?"))
+        let names: Vec<&str> = known.iter().map(|(n, _)| *n).collect();
+        Error::Config(format!("unknown {what} `{name}`; {}", suggestion(name, "", &names)))
     })
+}
+
+/// What may have been meant, or all that can be.
+fn suggestion(name: &str, prefix: &str, known: &[&str]) -> String {
+    match nearest(name, known.iter().copied()) {
+        Some(near) => format!("did you mean `{prefix}{near}`?"),
+        None => format!("known: {}", known.join(", ")),
+    }
 }
 
 fn parse(name: &str, text: &str) -> Result<Table> {
     text.parse::<Table>().map_err(|e| Error::Config(format!("{name}: {}", e.message())))
 }
 
+/// Keys of earlier versions, and what says it now.
+const MOVED: [(&str, &str); 1] = [("train.step.adam.lr", "train.step.schedule.lr")];
+
 /// Lays `over` onto `base`; a key that `base` does not have is unknown, because presets state every entry.
 fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
     for (key, value) in over {
         let full = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
         let Some(slot) = base.get_mut(key) else {
-            let candidates: Vec<&str> = base.keys().map(String::as_str).collect();
-            let nearest = nearest(key, candidates).unwrap_or_default();
+            let known: Vec<&str> = base.keys().map(String::as_str).collect();
             let prefix = if path.is_empty() { String::new() } else { format!("{path}.") };
-            return Err(Error::Config(format!("unknown key `{full}`; did you mean `{prefix}{nearest}`?")));
+            let said = MOVED.iter().find(|(old, _)| *old == full).map_or_else(
+                || suggestion(key, &prefix, &known),
+                |(_, new)| format!("did you mean `{new}`?"),
+            );
+            return Err(Error::Config(format!("unknown key `{full}`; {said}")));
         };
         match (slot, value) {
             (Value::Table(slot), Value::Table(value)) => merge(slot, value, &full)?,
@@ -399,12 +370,12 @@ mod tests {
     fn overrides_win_and_keep_types() {
         let set = [
             "loop.cycles=7".to_owned(),
-            "train.step.adam.lr = 1".to_owned(),
+            "train.step.schedule.lr = 1".to_owned(),
             "task.variant=square".to_owned(),
         ];
         let r = RunConfig::resolve("smoke", "nut_assembly", &set).unwrap().config;
         assert_eq!(r.closed_loop.cycles, 7);
-        assert!((r.train.step.adam.lr - 1.0).abs() < 1e-9);
+        assert!((r.train.step.schedule.lr - 1.0).abs() < 1e-9);
         assert_eq!(r.task.variant, "square");
     }
 
@@ -417,6 +388,7 @@ mod tests {
         );
         let set = |s: &str| text(RunConfig::resolve("smoke", "nut_assembly", &[s.to_owned()]));
         assert!(set("loop.cycle=3").contains("did you mean `loop.cycles`"));
+        assert!(set("train.step.adam.lr=1").contains("did you mean `train.step.schedule.lr`"));
         assert!(set("loop.cycles=many").contains("expected a value of type integer"));
         assert!(set("loop.cycles").contains("expected key=value"));
         assert!(set("policy.horizon=15").contains("horizon"));

@@ -1,13 +1,17 @@
 //! The run directory: what is in it, and how it is written so that a kill at any instant leaves it usable.
 
-use crate::config::Resolved;
+use crate::config::{Resolved, RunConfig};
 use crate::{Error, Result};
 use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest as _, Sha256};
 use std::borrow::Borrow;
+use std::fs::{File, TryLockError};
+use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Layout version of a run directory; 2: episodes are LeRobot datasets.
 const FORMAT: u32 = 2;
@@ -15,6 +19,14 @@ const FORMAT: u32 = 2;
 const ROBOT: &str = "panda";
 /// Beside the folders of a dataset: what this project knows of it.
 const NOTES: &str = "notes.json";
+/// State of a training in progress, in the folder of its policy.
+pub(crate) const TRAINING: &str = "training.safetensors";
+/// Ends the name of a dataset that is being written.
+const UNFINISHED: &str = ".unfinished";
+/// Begin the names of files on their way to their place, of this crate and of e2h-data.
+const TEMPORARY: [&str; 2] = [".tmp", ".new-"];
+/// Folders below a run's that it writes into: `iteration_NN/segments/data/chunk-000`, and one more.
+const DEEPEST: usize = 5;
 
 /// What a run is; written once, compared on resume.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -29,6 +41,54 @@ pub(crate) struct Identity {
 #[derive(Debug, Clone)]
 pub(crate) struct Directory {
     path: PathBuf,
+    /// Held as long as this process works in it; none for one that only reads, and on file systems that have no locks.
+    _lock: Option<Arc<File>>,
+}
+
+/// Names the process that works in the folder; locked, which ends with the process however it ends.
+const LOCK: &str = "run.lock";
+
+/// # Errors
+/// [`Error::Busy`] names the process that works here already.
+fn lock(folder: &Path) -> Result<Option<Arc<File>>> {
+    let place = folder.join(LOCK);
+    // Not truncated here: until the lock is ours the words are another's.
+    let opened = File::options().read(true).write(true).create(true).truncate(false).open(&place);
+    let mut file = opened.map_err(io("locking", &place))?;
+    match file.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => {
+            let mut owner = String::new();
+            // Words that cannot be read leave the message without a number.
+            let _ = (&file).take(200).read_to_string(&mut owner);
+            let owner = if owner.trim().is_empty() { "another process" } else { owner.trim() };
+            return Err(Error::Busy { path: folder.to_owned(), owner: e2h_core::one_line(owner) });
+        }
+        // Some network file systems have no locks; a run there is as safe as it was without.
+        Err(TryLockError::Error(e)) if e.kind() == std::io::ErrorKind::Unsupported => return Ok(None),
+        Err(TryLockError::Error(e)) => return Err(io("locking", &place)(e)),
+    }
+    file.set_len(0).map_err(io("writing", &place))?;
+    writeln!(file, "process {}", std::process::id()).map_err(io("writing", &place))?;
+    Ok(Some(Arc::new(file)))
+}
+
+/// Removes what killed processes of this run left: files on their way to their place, datasets on theirs, and training states of
+/// stages that are done.
+fn sweep(folder: &Path, depth: usize) -> Result<()> {
+    for entry in std::fs::read_dir(folder).map_err(io("reading", folder))?.flatten() {
+        let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
+        let Ok(kind) = entry.file_type() else { continue };
+        let done = || folder.join("notes.json").exists();
+        if kind.is_file() && (TEMPORARY.iter().any(|p| name.starts_with(p)) || (name == TRAINING && done())) {
+            std::fs::remove_file(&path).map_err(io("removing", &path))?;
+        } else if kind.is_dir() && name.ends_with(UNFINISHED) {
+            std::fs::remove_dir_all(&path).map_err(io("removing", &path))?;
+        } else if kind.is_dir() && depth > 0 {
+            sweep(&path, depth - 1)?;
+        }
+    }
+    Ok(())
 }
 
 pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
@@ -44,16 +104,24 @@ pub(crate) fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
 }
 
 fn sync(dir: &Path) -> Result<()> {
-    std::fs::File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
+    File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
 }
 
-fn differs_in_iterations_only(a: &str, b: &str) -> bool {
-    let without = |text: &str| {
-        let mut table = text.parse::<toml::Table>().ok()?;
-        table.get_mut("loop")?.as_table_mut()?.remove("iterations")?;
-        Some(table)
-    };
-    without(a).is_some_and(|a| without(b).is_some_and(|b| a == b))
+/// What a configuration of a run differs in from the one given; values count, not how they are written.
+enum Difference {
+    None,
+    Iterations,
+    More,
+}
+
+fn difference(written: &str, given: &Resolved) -> Difference {
+    let Ok(written) = RunConfig::from_text(&given.preset, written) else { return Difference::More };
+    let (mut a, b) = (written.config, &given.config);
+    if a == *b {
+        return Difference::None;
+    }
+    a.closed_loop.iterations = b.closed_loop.iterations;
+    if a == *b { Difference::Iterations } else { Difference::More }
 }
 
 impl Directory {
@@ -65,23 +133,32 @@ impl Directory {
         seed: u64,
         resolved: &Resolved,
     ) -> Result<Self> {
-        let this = Self { path: path.to_owned() };
         let identity =
             Identity { format: FORMAT, task: task.to_owned(), preset: resolved.preset.clone(), seed };
         let file = path.join("run.json");
+        if resume && !path.exists() {
+            return Err(Error::Nothing(path.to_owned()));
+        }
+        // A folder without run.json is a run that was killed at its first instant, or somebody else's.
+        let ours = |name: &str| name == "config.toml" || name == LOCK || name.starts_with(".tmp");
+        let foreign = path.exists()
+            && !file.exists()
+            && std::fs::read_dir(path)
+                .map_err(io("reading", path))?
+                .flatten()
+                .any(|e| !ours(&e.file_name().to_string_lossy()));
+        if foreign || (file.exists() && !resume) {
+            return Err(Error::Exists(path.to_owned()));
+        }
+        std::fs::create_dir_all(path).map_err(io("creating", path))?;
+        let this = Self { path: path.to_owned(), _lock: lock(path)? };
+        sweep(path, DEEPEST)?;
         if !file.exists() {
-            // A folder without run.json is a run that was killed at its first instant, or somebody else's.
-            let foreign = path.exists()
-                && std::fs::read_dir(path).map_err(io("reading", path))?.flatten().any(|e| {
-                    e.file_name() != "config.toml" && !e.file_name().to_string_lossy().starts_with(".tmp")
-                });
-            if foreign {
-                return Err(Error::Exists(path.to_owned()));
-            }
             write_atomic(&path.join("config.toml"), resolved.text.as_bytes())?;
             this.put("run.json", &identity)?;
             return Ok(this);
         }
+        // Made by another process since it was looked for.
         if !resume {
             return Err(Error::Exists(path.to_owned()));
         }
@@ -98,20 +175,22 @@ impl Directory {
         }
         let config = path.join("config.toml");
         let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;
-        if text != resolved.text && differs_in_iterations_only(&text, &resolved.text) {
+        match difference(&text, resolved) {
+            Difference::None => {}
             // A run can be made longer (or shorter): no stage that is done depends on how many follow.
-            write_atomic(&config, resolved.text.as_bytes())?;
-        } else if text != resolved.text {
-            let line = resolved.text.lines().zip(text.lines()).find(|(a, b)| a != b);
-            let (expected, found) = line.unwrap_or(("the configuration given", "another one"));
-            return differs("config.toml", expected.to_owned(), found.to_owned());
+            Difference::Iterations => write_atomic(&config, resolved.text.as_bytes())?,
+            Difference::More => {
+                let line = resolved.text.lines().zip(text.lines()).find(|(a, b)| a != b);
+                let (expected, found) = line.unwrap_or(("the configuration given", "another one"));
+                return differs("config.toml", expected.to_owned(), found.to_owned());
+            }
         }
         Ok(this)
     }
 
     /// A run directory that is there, to be read only.
     pub(crate) fn existing(path: &Path) -> Result<(Self, Identity)> {
-        let this = Self { path: path.to_owned() };
+        let this = Self { path: path.to_owned(), _lock: None };
         let foreign = |expected: &str, found: String| Error::Foreign {
             path: path.to_owned(),
             quantity: "run directory".to_owned(),
@@ -132,6 +211,24 @@ impl Directory {
 
     pub(crate) fn join(&self, name: impl AsRef<Path>) -> PathBuf {
         self.path.join(name)
+    }
+
+    /// SHA-256 of a file, to verify it with when it is read again.
+    pub(crate) fn sha256(&self, name: &str) -> Result<String> {
+        let path = self.join(name);
+        let bytes = std::fs::read(&path).map_err(io("reading", &path))?;
+        Ok(Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect())
+    }
+
+    /// Refuses a file that is not the one that was written; without a checksum any is taken.
+    pub(crate) fn verify(&self, name: &str, sha256: Option<&str>) -> Result<()> {
+        let Some(expected) = sha256 else { return Ok(()) };
+        let found = self.sha256(name)?;
+        if found == expected {
+            return Ok(());
+        }
+        let (path, expected) = (self.join(name), e2h_core::one_line(expected));
+        Err(Error::Foreign { path, quantity: "SHA-256".to_owned(), expected, found })
     }
 
     /// Writes `value` as JSON.
@@ -179,7 +276,7 @@ impl Directory {
         episodes: &[impl Borrow<Episode>],
         notes: &T,
     ) -> Result<()> {
-        let beside_name = format!("{name}.unfinished");
+        let beside_name = format!("{name}{UNFINISHED}");
         let (beside, place) = (self.join(&beside_name), self.join(name));
         if beside.exists() {
             std::fs::remove_dir_all(&beside).map_err(io("removing", &beside))?;

@@ -10,6 +10,17 @@ pub enum Error {
     /// The run directory is there already.
     #[error("{0} exists: give --resume to go on with it, or --out another folder")]
     Exists(PathBuf),
+    /// There is no run directory to go on with.
+    #[error("{0}: nothing to go on with; leave --resume out to start a run, or give --out the folder of one")]
+    Nothing(PathBuf),
+    /// Another process works in the run directory.
+    #[error("{path} is in use by {owner}: wait until it ends, or give --out another folder")]
+    Busy {
+        /// The run directory.
+        path: PathBuf,
+        /// The process.
+        owner: String,
+    },
     /// The run directory belongs to another run.
     #[error("{path}: {quantity}: expected {expected}, found {found}")]
     Foreign {

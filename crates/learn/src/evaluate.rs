@@ -16,11 +16,20 @@ pub struct Trial {
     pub steps: usize,
 }
 
+/// Which trials of an evaluation are shown.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Filmed {
+    /// So many from the first on.
+    First(usize),
+    /// So many, those that failed before those that succeeded.
+    FailuresFirst(usize),
+}
+
 /// Which trials of an evaluation are filmed, and how.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Filming {
-    /// Indices of the trials.
-    pub trials: Vec<usize>,
+    /// The trials.
+    pub trials: Filmed,
     /// Camera of the scene.
     pub camera: String,
     /// Side of the pictures, pixels.
@@ -34,9 +43,12 @@ pub struct Evaluated {
     pub evaluation: Evaluation,
     /// Every trial, in order.
     pub trials: Vec<Trial>,
-    /// One film a filmed trial, in the order asked for.
+    /// One film a filmed trial, in the order of [`Filmed`].
     pub films: Vec<(Outcome, Vec<Image>)>,
 }
+
+/// More trials than that are a slip of the keyboard.
+const MOST_TRIALS: usize = 100_000;
 
 struct Queue {
     /// Trials still to do, in reverse.
@@ -47,12 +59,13 @@ struct Queue {
 
 /// Runs `trials` trials of `direction` from external resets drawn from `seed`, several simulations side by side.
 /// `envs` are fresh simulations of the same task, one a lane. Filming changes nothing else: a trial's last bits depend on how many
-/// others the policy answers with it, so a film has to be made in the evaluation itself to show what was counted.
+/// others the policy answers with it, so a film is of the evaluation itself and shows what was counted.
 ///
 /// # Errors
-/// When the observations do not fit the policy or the simulation fails.
+/// Before any trial when there are none or too many, or the film's camera or size is not one; when the observations do not fit the
+/// policy or the simulation fails.
 pub fn evaluate(
-    envs: Vec<Env>,
+    mut envs: Vec<Env>,
     policy: &dyn Policy,
     direction: Direction,
     trials: usize,
@@ -65,15 +78,26 @@ pub fn evaluate(
     if n == 0 || trials == 0 {
         return Err(Error::Config("evaluation needs at least one simulation and one trial".to_owned()));
     }
+    if trials > MOST_TRIALS {
+        return Err(Error::Config(format!("trials: expected at most {MOST_TRIALS}, got {trials}")));
+    }
+    if let (Some(f), Some(env)) = (filming, envs.first_mut()) {
+        env.render(&f.camera, f.size, f.size)?;
+    }
+    let films = |trial: usize| {
+        filming.is_some_and(|f| match f.trials {
+            Filmed::First(n) => trial < n,
+            Filmed::FailuresFirst(n) => n > 0,
+        })
+    };
     let begin = |lane: &mut Lane<Queue>| -> Result<()> {
         let Some(trial) = lane.state.trials.pop() else { return Ok(()) };
         lane.state.current = trial;
         lane.env.reset(direction, &mut stream(seed, "evaluate/reset", 0, trial as u64))?;
         let rng = stream(seed, "evaluate/act", 0, trial as u64);
         let mut rollout = Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, None)?;
-        if let Some(f) = filming.filter(|f| f.trials.contains(&trial)) {
-            let film = Film { camera: f.camera.clone(), size: f.size, frames: vec![] };
-            rollout = rollout.filmed(&mut lane.env, film)?;
+        if films(trial) {
+            rollout = rollout.filmed(&lane.env);
         }
         lane.rollout = Some(rollout);
         Ok(())
@@ -105,16 +129,29 @@ pub fn evaluate(
             bar.set(done().count() as u64, &format!("{k} succeeded"));
         },
     )?;
-    let mut done: Vec<(usize, Trial, Option<Film>)> = lanes.into_iter().flat_map(|l| l.state.done).collect();
+    let mut done: Vec<(usize, Trial, Option<Film>)> = vec![];
+    let mut envs: Vec<Env> = vec![];
+    for lane in lanes {
+        done.extend(lane.state.done);
+        envs.push(lane.env);
+    }
     done.sort_by_key(|(i, _, _)| *i);
     let results: Vec<Trial> = done.iter().map(|(_, t, _)| *t).collect();
-    let films = filming.map_or(vec![], |f| {
-        let film = |&i: &usize| {
-            let (_, trial, film) = done.get_mut(i)?;
-            Some((trial.outcome, film.take()?.frames))
+    let mut films = vec![];
+    if let (Some(f), Some(env)) = (filming, envs.first_mut()) {
+        let wanted = match f.trials {
+            Filmed::First(n) => n,
+            Filmed::FailuresFirst(n) => {
+                done.sort_by_key(|(i, trial, _)| (trial.outcome.is_success(), *i));
+                n
+            }
         };
-        f.trials.iter().filter_map(film).collect()
-    });
+        for (_, trial, film) in done.iter().take(wanted) {
+            if let Some(film) = film {
+                films.push((trial.outcome, film.draw(env, &f.camera, f.size)?));
+            }
+        }
+    }
     let successes: Vec<usize> = results.iter().filter(|t| t.outcome.is_success()).map(|t| t.steps).collect();
     let k = successes.len();
     bar.finish(&format!("{k} of {trials} succeeded"));

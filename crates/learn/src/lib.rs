@@ -45,7 +45,7 @@ pub mod view;
 pub use collect::{Collected, collect};
 pub use config::{Resolved, RunConfig};
 pub use error::{Error, Result};
-pub use evaluate::{Evaluated, Filming, Trial, evaluate};
+pub use evaluate::{Evaluated, Filmed, Filming, Trial, evaluate};
 pub use explore::ExploreConfig;
 pub use progress::{Bar, Progress};
 pub use published::Published;

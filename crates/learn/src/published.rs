@@ -35,13 +35,27 @@ impl Published {
         };
         let config: RunConfig = serde_json::from_value(checkpoint.provenance.run.clone())
             .map_err(|e| foreign("run configuration", "one of this version", e.to_string()))?;
+        // Settings are as foreign as weights: what builds the environment is looked at like a configuration of one's own.
+        config.validate().map_err(|e| foreign("run configuration", "values that work", e.to_string()))?;
         let direction = match checkpoint.provenance.direction.as_str() {
             "hard" => Direction::Hard,
             "easy" => Direction::Easy,
             other => return Err(foreign("direction", "hard or easy", other.to_owned())),
         };
         let task = e2h_env::task(&config.task.name, &config.task.options())?;
-        let env = Env::new(task, &config.env)?;
+        let mut env = Env::new(task, &config.env)?;
+        let p = &checkpoint.config;
+        if !p.cameras.is_empty() && (!config.env.cameras || p.image_size != config.env.image_size) {
+            let found = format!("{} (images: {})", config.env.image_size, config.env.cameras);
+            return Err(foreign(
+                "env.image_size of its run",
+                &format!("{} as the policy's", p.image_size),
+                found,
+            ));
+        }
+        if !p.cameras.is_empty() {
+            env.select_cameras(&p.cameras)?;
+        }
         Ok(Self { policy, checkpoint, config, direction, env })
     }
 

@@ -11,17 +11,24 @@ use e2h_env::Env;
 use rayon::prelude::*;
 use std::collections::VecDeque;
 
-/// Pictures of a rollout for people, every second control step.
+/// A rollout for people to see, every second control step: physical states, which are small, and drawn only if they are wanted.
+#[derive(Default)]
 pub(crate) struct Film {
-    pub(crate) camera: String,
-    pub(crate) size: usize,
-    pub(crate) frames: Vec<Image>,
+    states: Vec<Vec<f64>>,
 }
 
 impl Film {
-    fn shoot(&mut self, env: &mut Env) -> Result<()> {
-        self.frames.push(env.render(&self.camera, self.size, self.size)?);
-        Ok(())
+    fn shoot(&mut self, env: &Env) {
+        self.states.push(env.save());
+    }
+
+    /// The pictures, drawn by any environment of the same task.
+    pub(crate) fn draw(&self, env: &mut Env, camera: &str, size: usize) -> Result<Vec<Image>> {
+        let picture = |state: &Vec<f64>| {
+            env.restore(state)?;
+            Ok(env.render(camera, size, size)?)
+        };
+        self.states.iter().map(picture).collect()
     }
 }
 
@@ -62,10 +69,11 @@ impl Rollout {
     }
 
     /// Films the rollout from its present state on.
-    pub(crate) fn filmed(mut self, env: &mut Env, mut film: Film) -> Result<Self> {
-        film.shoot(env)?;
+    pub(crate) fn filmed(mut self, env: &Env) -> Self {
+        let mut film = Film::default();
+        film.shoot(env);
         self.film = Some(film);
-        Ok(self)
+        self
     }
 
     /// Displaces the goals of the rollout.
@@ -88,7 +96,7 @@ impl Rollout {
             let end = env.step(&action)?;
             self.steps += 1;
             if let Some(film) = self.film.as_mut().filter(|_| self.steps.is_multiple_of(2) || end.is_some()) {
-                film.shoot(env)?;
+                film.shoot(env);
             }
             if let Some(outcome) = end {
                 let episode = self.episode.take().map(|mut episode| {

@@ -7,7 +7,7 @@ mod measure;
 
 use crate::collect::{Collected, collect};
 use crate::config::{Resolved, RunConfig};
-use crate::directory::{Directory, write_atomic};
+use crate::directory::{Directory, TRAINING, write_atomic};
 use crate::picture;
 use crate::record::{Collection, Reversal};
 use crate::tensorboard::Events;
@@ -91,6 +91,9 @@ struct AcceptedNotes {
 struct TrainNotes {
     minutes: f64,
     loss: f64,
+    /// Of `policy.json`, which has that of the weights. Runs of version 0.1 have none.
+    #[serde(default)]
+    policy_sha256: Option<String>,
 }
 
 impl Run {
@@ -108,7 +111,10 @@ impl Run {
         let config = &resolved.config;
         let compute = Compute::open(&options.device, config.device)?;
         let task = e2h_env::task(&config.task.name, &config.task.options())?;
-        let env = Env::new(task.clone(), &config.env)?;
+        let mut env = Env::new(task.clone(), &config.env)?;
+        if !config.policy.cameras.is_empty() {
+            env.select_cameras(&config.policy.cameras)?;
+        }
         let path = options.out.clone().unwrap_or_else(|| {
             PathBuf::from(format!("runs/{}-{}-{}", options.task, options.preset, options.seed))
         });
@@ -311,7 +317,9 @@ impl Run {
     ) -> Result<DiffusionPolicy> {
         let c = self.config();
         let notes_file = format!("{place}/notes.json");
-        if self.dir.get::<TrainNotes>(&notes_file)?.is_some() {
+        let description = format!("{place}/policy.json");
+        if let Some(notes) = self.dir.get::<TrainNotes>(&notes_file)? {
+            self.dir.verify(&description, notes.policy_sha256.as_deref())?;
             return Ok(DiffusionPolicy::load(&self.dir.join(place))?.0.on(&self.compute)?);
         }
         let clock = Instant::now();
@@ -322,7 +330,7 @@ impl Run {
         let mut trainer =
             Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?
                 .on(&self.compute)?;
-        let saved = self.dir.join(format!("{place}/training.safetensors"));
+        let saved = self.dir.join(format!("{place}/{TRAINING}"));
         if saved.exists() {
             trainer.restore(&saved)?;
         }
@@ -367,7 +375,10 @@ impl Run {
             DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?.on(&self.compute)?;
         policy.save(&self.dir.join(place), &self.provenance(direction, iteration)?)?;
         let minutes = clock.elapsed().as_secs_f64() / 60.0;
-        self.dir.put(&notes_file, &TrainNotes { minutes, loss })?;
+        self.dir.put(
+            &notes_file,
+            &TrainNotes { minutes, loss, policy_sha256: Some(self.dir.sha256(&description)?) },
+        )?;
         if saved.exists() {
             std::fs::remove_file(&saved).map_err(crate::directory::io("removing", &saved))?;
         }
@@ -528,7 +539,12 @@ impl Run {
                 .flat_map(|k| &k.segments)
                 .map(|segment| critic.evaluate(segment))
                 .collect::<std::result::Result<Vec<_>, _>>()?;
-            critic_filter(kinematic, &values, &r.suffix, &r.advantage)?
+            let suffix = r.suffix.trusting(successes);
+            if suffix.enabled != r.suffix.enabled {
+                let needed = r.suffix.min_successes;
+                notes.push(format!("suffix: not cut, the critic has seen {successes} successes of {needed}"));
+            }
+            critic_filter(kinematic, &values, &suffix, &r.advantage)?
         };
         let critic_minutes = clock.elapsed().as_secs_f64() / 60.0;
 
@@ -595,13 +611,18 @@ fn goal_note(goal: &Goal, hard: &[Episode], kept: usize, of: usize) -> String {
     )
 }
 
+/// More threads than that no machine has cores for.
+const MOST_THREADS: usize = 1024;
+
 /// Sets how many threads compute; never changes a result. A pool that is already running stays as it is.
 ///
 /// # Errors
-/// When asked for none.
+/// When asked for none, or for more than any machine has.
 pub fn set_threads(threads: usize) -> Result<()> {
-    if threads == 0 {
-        return Err(Error::Config("threads: expected at least 1, got 0".to_owned()));
+    if !(1..=MOST_THREADS).contains(&threads) {
+        return Err(Error::Config(format!(
+            "threads: expected at least 1 and at most {MOST_THREADS}, got {threads}"
+        )));
     }
     drop(rayon::ThreadPoolBuilder::new().num_threads(threads).build_global());
     Ok(())

@@ -55,14 +55,21 @@ impl Policy for Still {
 }
 
 fn collected(explore: ExploreConfig, threads: usize) -> Collected {
+    collected_in(1, explore, threads)
+}
+
+fn collected_in(iteration: u32, explore: ExploreConfig, threads: usize) -> Collected {
     let env = EnvConfig { cameras: false, horizon_hard: 16, horizon_easy: 150, ..EnvConfig::default() };
     let task = task("cube_pick_place", &TaskOptions::default()).unwrap();
     let mut config = RunConfig::resolve("smoke", "cube_pick_place", &[]).unwrap().config.closed_loop;
     (config.cycles, config.loops, config.keep_rollouts, config.explore) = (4, 2, true, explore);
     let first = Env::new(task, &env).unwrap();
     let envs = (0..config.loops).map(|_| first.clone_shared().unwrap()).collect();
-    let origin =
-        Origin { kind: Kind::Rollout, ..Origin::demonstration("cube_pick_place", Direction::Easy, 0, 7) };
+    let origin = Origin {
+        kind: Kind::Rollout,
+        iteration,
+        ..Origin::demonstration("cube_pick_place", Direction::Easy, 0, 7)
+    };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     pool.install(|| collect(envs, &Still, &Carry, &config, &origin, &Progress::new(true))).unwrap()
 }
@@ -99,4 +106,36 @@ fn excursions_are_zero_at_the_goal_recorded_beyond_and_the_same_on_any_threads()
             assert_eq!(with, without);
         }
     }
+}
+
+#[test]
+fn every_value_changes_what_is_collected() {
+    let base = ExploreConfig { enabled: true, release: 0.5, ..ExploreConfig::default() };
+    let rows = |explore: &ExploreConfig| collected(explore.clone(), 2).rejected;
+    let before = rows(&base);
+    assert_eq!(before, rows(&base));
+    type Change = fn(&mut ExploreConfig);
+    let changes: [(&str, Change); 7] = [
+        ("enabled", |c| c.enabled = false),
+        ("share", |c| c.share = 0.5),
+        ("sideways_m", |c| c.sideways_m = 0.02),
+        ("up_m", |c| c.up_m = 0.0),
+        ("yaw_rad", |c| c.yaw_rad = 0.1),
+        ("band_hz", |c| c.band_hz = [0.1, 0.3]),
+        ("ramp_m", |c| c.ramp_m = 0.2),
+    ];
+    for (name, change) in changes {
+        let mut other = base.clone();
+        change(&mut other);
+        assert_ne!(before, rows(&other), "{name}");
+    }
+    // Half way up, where an object is being put down, and in a later iteration.
+    assert_ne!(before, rows(&ExploreConfig { release: 1.0, ..base.clone() }), "release");
+    let grown = ExploreConfig { growth: 1.5, ..base.clone() };
+    assert_ne!(rows_of(2, &base), rows_of(2, &grown), "growth");
+    assert_eq!(rows_of(1, &base), rows_of(1, &grown), "growth begins with the second iteration");
+}
+
+fn rows_of(iteration: u32, explore: &ExploreConfig) -> Vec<e2h_core::Episode> {
+    collected_in(iteration, explore.clone(), 2).rejected
 }

@@ -218,6 +218,10 @@ impl Params {
     /// # Errors
     /// What `f` returns, and [`Error::Import`] with every missing, unexpected and mis-shaped tensor.
     pub fn check<T>(weights: &Weights, f: impl FnOnce(&Builder<'_>) -> Result<T>) -> Result<()> {
+        fit(Self::shapes_of(f)?.iter(), weights)
+    }
+
+    fn shapes_of<T>(f: impl FnOnce(&Builder<'_>) -> Result<T>) -> Result<Shapes> {
         let compute = Compute::cpu();
         let nothing = Tensor::zeros((), DType::F32, compute.device())?;
         let shared = Shared {
@@ -229,8 +233,15 @@ impl Params {
             plan: Some((RefCell::default(), nothing)),
         };
         f(&Builder { shared: &shared, path: String::new() })?;
-        let shapes = shared.plan.map(|(shapes, _)| shapes.into_inner()).unwrap_or_default();
-        fit(shapes.iter(), weights)
+        Ok(shared.plan.map(|(shapes, _)| shapes.into_inner()).unwrap_or_default())
+    }
+
+    /// How many numbers the parameters that `f` asks for would be, without taking the memory for them.
+    ///
+    /// # Errors
+    /// What `f` returns.
+    pub fn count_of<T>(f: impl FnOnce(&Builder<'_>) -> Result<T>) -> Result<u128> {
+        Ok(Self::shapes_of(f)?.values().map(|shape| shape.iter().map(|&n| n as u128).product::<u128>()).sum())
     }
 
     /// Where they are, and how they are computed with.

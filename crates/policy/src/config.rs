@@ -1,5 +1,6 @@
-use crate::{Error, Result};
-use e2h_nn::{AdamConfig, EmaConfig, LrSchedule};
+use crate::model::Widths;
+use crate::{DiffusionModel, Error, Result};
+use e2h_nn::{AdamConfig, EmaConfig, LrSchedule, Params, RgbEncoderConfig, UnetConfig};
 use serde::{Deserialize, Serialize};
 
 /// What the network is asked for.
@@ -195,6 +196,28 @@ impl PolicyConfig {
         self.n_obs_steps * state + self.n_image_steps * self.cameras.len() * self.image_features
     }
 
+    /// The encoder of an image.
+    pub(crate) fn encoder(&self) -> RgbEncoderConfig {
+        RgbEncoderConfig {
+            height: self.crop_size,
+            width: self.crop_size,
+            base_width: self.encoder_width,
+            stage_blocks: self.encoder_blocks.clone(),
+            keypoints: self.keypoints,
+            feature_dim: self.image_features,
+        }
+    }
+
+    /// Numbers in the weights of a policy; takes no memory for them.
+    ///
+    /// # Errors
+    /// As [`PolicyConfig::validate`].
+    pub fn count_parameters(&self) -> Result<u128> {
+        self.validate()?;
+        let widths = Widths { state: self.state_features(), action: e2h_core::ACTION_DIM };
+        Ok(Params::count_of(|b| DiffusionModel::parts(self, widths, b))?)
+    }
+
     /// Checks that the parts fit together.
     ///
     /// # Errors
@@ -208,10 +231,10 @@ impl PolicyConfig {
         };
         // A file may say anything; what is above these has no memory anywhere, and its products no number.
         for (name, value, least, most) in [
-            ("n_obs_steps", self.n_obs_steps, 1, 1 << 10),
-            ("horizon", self.horizon, 1, 1 << 16),
-            ("train_timesteps", self.train_timesteps, 1, 1 << 20),
-            ("image_size", self.image_size, 0, 1 << 16),
+            ("n_obs_steps", self.n_obs_steps, 1, 1 << 7),
+            ("horizon", self.horizon, 1, 1 << 12),
+            ("train_timesteps", self.train_timesteps, 1, 1 << 12),
+            ("image_size", self.image_size, 0, 1 << 12),
             ("cameras", self.cameras.len(), 0, 1 << 6),
             ("image_features", self.image_features, 0, 1 << 16),
             ("levels of down_dims", self.down_dims.len(), 1, MOST_LEVELS),
@@ -264,10 +287,13 @@ impl PolicyConfig {
             self.inference_steps > 0 && self.inference_steps <= self.train_timesteps,
             format!("inference_steps: expected 1 to {}, got {}", self.train_timesteps, self.inference_steps),
         );
-        check(self.guidance.is_finite(), format!("guidance: expected a number, got {}", self.guidance));
         check(
-            self.state_limit >= 0.0 && self.state_limit.is_finite(),
-            format!("state_limit: expected 0 or more, got {}", self.state_limit),
+            (0.0..=100.0).contains(&self.guidance),
+            format!("guidance: expected 0 to 100, got {}", self.guidance),
+        );
+        check(
+            (0.0..=1e6).contains(&self.state_limit),
+            format!("state_limit: expected 0 to 1e6, got {}", self.state_limit),
         );
         check(
             self.image_scaling.is_empty() || self.image_scaling.len() == self.cameras.len(),
@@ -279,23 +305,46 @@ impl PolicyConfig {
         );
         for scaling in &self.image_scaling {
             check(
-                scaling.mean.iter().all(|v| v.is_finite())
-                    && scaling.std.iter().all(|&v| v > 0.0 && v.is_finite()),
-                format!("image_scaling: expected finite means and positive deviations, got {scaling:?}"),
+                scaling.mean.iter().all(|v| (-100.0..=100.0).contains(v))
+                    && scaling.std.iter().all(|v| (1e-6..=100.0).contains(v)),
+                format!(
+                    "image_scaling: expected means of -100 to 100 and deviations of 1e-6 to 100, got {scaling:?}"
+                ),
             );
         }
+        for (i, camera) in self.cameras.iter().enumerate() {
+            check(
+                !self.cameras[..i].contains(camera),
+                format!("cameras: expected each name once, got `{}` twice", e2h_core::one_line(camera)),
+            );
+        }
+        let unet = UnetConfig {
+            input_dim: e2h_core::ACTION_DIM,
+            down_dims: self.down_dims.clone(),
+            kernel_size: self.kernel_size,
+            n_groups: self.n_groups,
+            step_embed_dim: self.step_embed_dim,
+            cond_dim: 0,
+        };
+        // What is not said above, in the words of the layers.
+        if let Err(e) = unet.validate() {
+            check(false, e.to_string());
+        }
         if !self.cameras.is_empty() {
+            if let Err(e) = self.encoder().validate() {
+                check(false, e.to_string());
+            }
             check(
                 self.crop_size > 0 && self.crop_size <= self.image_size,
                 format!("crop_size: expected 1 to image_size ({}), got {}", self.image_size, self.crop_size),
             );
             check(
-                self.encoder_width > 0 && self.encoder_width.is_multiple_of(16),
-                format!("encoder_width: expected a multiple of 16, got {}", self.encoder_width),
+                (16..=1 << 16).contains(&self.encoder_width) && self.encoder_width.is_multiple_of(16),
+                format!("encoder_width: expected a multiple of 16 up to 65536, got {}", self.encoder_width),
             );
             check(
-                !self.encoder_blocks.is_empty() && !self.encoder_blocks.contains(&0),
-                format!("encoder_blocks: expected at least one block a stage, got {:?}", self.encoder_blocks),
+                !self.encoder_blocks.is_empty() && self.encoder_blocks.iter().all(|n| (1..=64).contains(n)),
+                format!("encoder_blocks: expected 1 to 64 blocks a stage, got {:?}", self.encoder_blocks),
             );
         }
         if problems.is_empty() { Ok(()) } else { Err(Error::Config(problems.join("; "))) }
@@ -321,22 +370,125 @@ pub struct TrainConfig {
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub keypoint_sharpness: f32,
     /// Optimiser.
-    pub adam: AdamConfig,
+    pub adam: ScheduledAdam,
     /// Learning rate over the steps.
     pub schedule: ScheduleConfig,
     /// Average of the weights that the policy acts with.
     pub ema: EmaConfig,
 }
 
+/// Most samples of a step, noises counted.
+const MOST_SAMPLES: usize = 1 << 20;
+
 impl TrainConfig {
     pub(crate) fn optimiser(&self) -> AdamConfig {
-        without_zero_clip(self.adam)
+        let a = self.adam;
+        without_zero_clip(AdamConfig {
+            lr: self.schedule.lr,
+            beta1: a.beta1,
+            beta2: a.beta2,
+            eps: a.eps,
+            weight_decay: a.weight_decay,
+            decoupled: a.decoupled,
+            clip_norm: a.clip_norm,
+        })
+    }
+
+    /// All problems with the values.
+    #[must_use]
+    pub fn validate(&self) -> Vec<String> {
+        let mut problems = vec![];
+        let mut check = |ok: bool, text: String| {
+            if !ok {
+                problems.push(text);
+            }
+        };
+        let samples = self.conditions.saturating_mul(self.noises);
+        check(
+            self.conditions > 0 && self.noises > 0 && samples <= MOST_SAMPLES,
+            format!(
+                "conditions and noises: expected at least 1 and a product of at most {MOST_SAMPLES}, got {} and {}",
+                self.conditions, self.noises
+            ),
+        );
+        check(
+            (0.0..1.0).contains(&self.conditioning_dropout),
+            format!("conditioning_dropout: expected 0 to below 1, got {}", self.conditioning_dropout),
+        );
+        check(
+            (0.0..=10.0).contains(&self.observation_noise),
+            format!("observation_noise: expected 0 to 10, got {}", self.observation_noise),
+        );
+        check(
+            self.keypoint_sharpness > 0.0 && self.keypoint_sharpness <= 1000.0,
+            format!(
+                "keypoint_sharpness: expected more than 0 and at most 1000, got {}",
+                self.keypoint_sharpness
+            ),
+        );
+        check(
+            self.schedule.warmup <= LONGEST,
+            format!("schedule.warmup: expected at most {LONGEST}, got {}", self.schedule.warmup),
+        );
+        if let Err(e) = self.optimiser().validate() {
+            let part = if e.to_string().contains("lr:") { "schedule" } else { "adam" };
+            check(false, format!("{part}.{e}"));
+        }
+        if let Err(e) = self.ema.validate() {
+            check(false, format!("ema.{e}"));
+        }
+        problems
+    }
+}
+
+/// Most steps of a training.
+const LONGEST: usize = 100_000_000;
+
+/// Adam whose learning rate is that of a [`ScheduleConfig`]; the fields of [`AdamConfig`] but the rate.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(from = "WrittenAdam")]
+pub struct ScheduledAdam {
+    /// Decay of the mean of the gradients.
+    pub beta1: f32,
+    /// Decay of the mean of their squares.
+    pub beta2: f32,
+    /// Added to the root of the mean square.
+    pub eps: f32,
+    /// Weight decay.
+    pub weight_decay: f32,
+    /// Whether the decay acts on the weights (AdamW) or is added to the gradient (Adam with L2).
+    pub decoupled: bool,
+    /// Longest gradient, Euclidean norm over all parameters; none and 0 for no limit.
+    pub clip_norm: Option<f32>,
+}
+
+impl Default for ScheduledAdam {
+    fn default() -> Self {
+        AdamConfig::default().into()
+    }
+}
+
+impl From<AdamConfig> for ScheduledAdam {
+    fn from(adam: AdamConfig) -> Self {
+        let AdamConfig { lr: _, beta1, beta2, eps, weight_decay, decoupled, clip_norm } = adam;
+        Self { beta1, beta2, eps, weight_decay, decoupled, clip_norm }
+    }
+}
+
+/// As files have it: up to version 0.1 they had a rate too, without effect.
+#[derive(Deserialize)]
+#[serde(transparent)]
+struct WrittenAdam(AdamConfig);
+
+impl From<WrittenAdam> for ScheduledAdam {
+    fn from(written: WrittenAdam) -> Self {
+        written.0.into()
     }
 }
 
 /// A clip of 0 in a file means none: TOML has no way to say so.
 pub(crate) fn without_zero_clip(adam: AdamConfig) -> AdamConfig {
-    AdamConfig { clip_norm: adam.clip_norm.filter(|&c| c > 0.0), ..adam }
+    AdamConfig { clip_norm: adam.clip_norm.filter(|&c| c != 0.0), ..adam }
 }
 
 /// Shape of the learning rate.
@@ -393,4 +545,40 @@ pub struct CriticConfig {
     pub validation: f32,
     /// Optimiser.
     pub adam: AdamConfig,
+}
+
+impl CriticConfig {
+    /// All problems with the values, for a critic of rollouts as `policy` sees them.
+    #[must_use]
+    pub fn validate(&self, policy: &PolicyConfig) -> Vec<String> {
+        let mut problems = vec![];
+        let mut check = |ok: bool, text: String| {
+            if !ok {
+                problems.push(text);
+            }
+        };
+        for (name, value, most) in [("batch", self.batch, MOST_SAMPLES), ("steps", self.steps, LONGEST)] {
+            check((1..=most).contains(&value), format!("{name}: expected 1 to {most}, got {value}"));
+        }
+        let most = policy.image_size;
+        check(
+            policy.cameras.is_empty() || (1..=most).contains(&self.crop_size),
+            format!("crop_size: expected 1 to the images' {most}, got {}", self.crop_size),
+        );
+        check(
+            self.hidden.len() <= MOST_LEVELS && self.hidden.iter().all(|n| (1..=1 << 16).contains(n)),
+            format!("hidden: expected at most {MOST_LEVELS} widths of 1 to 65536, got {:?}", self.hidden),
+        );
+        for (name, value) in [("dropout", self.dropout), ("validation", self.validation)] {
+            check((0.0..1.0).contains(&value), format!("{name}: expected 0 to below 1, got {value}"));
+        }
+        check(
+            (0.0..=1.0).contains(&self.colour_jitter),
+            format!("colour_jitter: expected 0 to 1, got {}", self.colour_jitter),
+        );
+        if let Err(e) = without_zero_clip(self.adam).validate() {
+            check(false, format!("adam.{e}"));
+        }
+        problems
+    }
 }

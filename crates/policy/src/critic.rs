@@ -41,6 +41,10 @@ impl Critic {
         mode: Mode,
         seed: u64,
     ) -> Result<Self> {
+        let problems = critic.validate(policy);
+        if !problems.is_empty() {
+            return Err(Error::Config(format!("critic: {}", problems.join("; "))));
+        }
         let config = Self::config(policy, critic);
         let (params, (condition, head)) =
             Params::build_on(compute, mode, &mut stream(seed, "critic/weights", 0, 0), |b| {
@@ -63,7 +67,7 @@ impl Critic {
     }
 
     fn config(policy: &PolicyConfig, critic: &CriticConfig) -> PolicyConfig {
-        PolicyConfig { crop_size: critic.crop_size.min(policy.crop_size), ..policy.clone() }
+        PolicyConfig { crop_size: critic.crop_size, ..policy.clone() }
     }
 
     fn parts(
@@ -109,7 +113,7 @@ impl Critic {
             return Ok(());
         }
         let mut augment = augment;
-        for camera in 0..c.cameras.len() {
+        for (camera, name) in c.cameras.iter().enumerate() {
             let (corner, jitter) = match &mut augment {
                 Some((rng, width)) => {
                     let mut draw = || if *width > 0.0 { rng.random_range(-*width..=*width) } else { 0.0 };
@@ -118,15 +122,15 @@ impl Critic {
                 }
                 None => (c.centre_crop(), None),
             };
-            let frames =
-                episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
-                    Error::Data(format!(
-                        "expected images of {0} x {0} from camera {1}, found {2:?}",
-                        c.image_size,
-                        c.cameras[camera],
-                        episode.frames.iter().map(|f| (&f.camera, f.height)).collect::<Vec<_>>()
-                    ))
-                })?;
+            let named = episode.frames.iter().find(|f| f.camera == *name);
+            let frames = named.filter(|f| f.height == c.image_size).ok_or_else(|| {
+                Error::Data(format!(
+                    "expected images of {0} x {0} from camera {1}, found {2:?}",
+                    c.image_size,
+                    name,
+                    episode.frames.iter().map(|f| (&f.camera, f.height)).collect::<Vec<_>>()
+                ))
+            })?;
             for &row in &rows[c.n_obs_steps - c.n_image_steps..] {
                 host.push_image(camera, frames.image(row), corner, c.crop_size, jitter);
             }

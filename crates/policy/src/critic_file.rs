@@ -132,7 +132,9 @@ impl Critic {
             return Err(Error::Checkpoint { path: weights_path, problem });
         }
         let (weights, _) = read_weights(&weights_path)?;
-        let critic = Self::with_weights(&file.network, &file.critic, &normaliser, &weights)
+        // Up to version 0.1 a crop larger than the policy's was cut to it; the network says what was trained with.
+        let settings = CriticConfig { crop_size: file.network.crop_size, ..file.critic };
+        let critic = Self::with_weights(&file.network, &settings, &normaliser, &weights)
             .map_err(|e| Error::Checkpoint { path: dir.to_owned(), problem: e.to_string() })?;
         Ok((critic, file.provenance))
     }

@@ -3,9 +3,7 @@
 use crate::{PolicyConfig, Result};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Rng};
-use e2h_nn::{
-    Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, RgbEncoderConfig, UnetConfig, Weights,
-};
+use e2h_nn::{Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, UnetConfig, Weights};
 
 /// Turns images and states into one vector an observation history.
 pub(crate) struct ConditionEncoder {
@@ -17,14 +15,7 @@ pub(crate) struct ConditionEncoder {
 
 impl ConditionEncoder {
     pub(crate) fn new(config: &PolicyConfig, state: usize, builder: &Builder) -> e2h_nn::Result<Self> {
-        let encoder = RgbEncoderConfig {
-            height: config.crop_size,
-            width: config.crop_size,
-            base_width: config.encoder_width,
-            stage_blocks: config.encoder_blocks.clone(),
-            keypoints: config.keypoints,
-            feature_dim: config.image_features,
-        };
+        let encoder = config.encoder();
         let names: Vec<String> = match (config.cameras.len(), config.share_encoder) {
             (0, _) => vec![],
             (_, true) => vec!["rgb_encoder".to_owned()],
@@ -131,7 +122,7 @@ impl DiffusionModel {
         Ok(this)
     }
 
-    fn parts(
+    pub(crate) fn parts(
         config: &PolicyConfig,
         widths: Widths,
         b: &Builder<'_>,

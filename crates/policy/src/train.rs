@@ -9,6 +9,8 @@ use e2h_nn::{
     Adam, Compute, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows,
 };
 use rand::Rng as _;
+use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -60,6 +62,25 @@ impl<'a> TrainingData<'a> {
     }
 }
 
+/// Where a training state's header has its checksum.
+const SEAL: &str = "sha256";
+
+/// SHA-256 of names, shapes and numbers.
+fn digest(weights: &Weights) -> String {
+    let mut hasher = Sha256::new();
+    for (name, tensor) in weights {
+        hasher.update((name.len() as u64).to_le_bytes());
+        hasher.update(name);
+        for size in std::iter::once(&tensor.shape.len()).chain(&tensor.shape) {
+            hasher.update((*size as u64).to_le_bytes());
+        }
+        for value in &tensor.data {
+            hasher.update(value.to_le_bytes());
+        }
+    }
+    hasher.finalize().iter().map(|b| format!("{b:02x}")).collect()
+}
+
 /// A policy in training: network, optimiser, average of the weights, step counter.
 pub struct Trainer {
     model: DiffusionModel,
@@ -88,17 +109,9 @@ impl Trainer {
         seed: u64,
         purpose: &str,
     ) -> Result<Self> {
-        if train.conditions == 0 || train.noises == 0 {
-            return Err(Error::Config(format!(
-                "conditions and noises: expected at least 1, got {} and {}",
-                train.conditions, train.noises
-            )));
-        }
-        if !(train.keypoint_sharpness.is_finite() && train.keypoint_sharpness > 0.0) {
-            return Err(Error::Config(format!(
-                "keypoint_sharpness: expected more than 0, got {}",
-                train.keypoint_sharpness
-            )));
+        let problems = train.validate();
+        if !problems.is_empty() {
+            return Err(Error::Config(problems.join("; ")));
         }
         let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
         if let Some(weights) = start {
@@ -189,21 +202,17 @@ impl Trainer {
                 Some((t.observation_noise, rng)),
             );
             if c.n_image_steps > 0 {
-                for camera in 0..c.cameras.len() {
+                for (camera, name) in c.cameras.iter().enumerate() {
                     let corner = c.random_crop(rng);
-                    let frames =
-                        episode.frames.get(camera).filter(|f| f.height == c.image_size).ok_or_else(|| {
-                            Error::Data(format!(
-                                "expected images of {0} x {0} from {1:?}, found {2:?}",
-                                c.image_size,
-                                c.cameras,
-                                episode
-                                    .frames
-                                    .iter()
-                                    .map(|f| (&f.camera, f.height, f.width))
-                                    .collect::<Vec<_>>()
-                            ))
-                        })?;
+                    let named = episode.frames.iter().find(|f| f.camera == *name);
+                    let frames = named.filter(|f| f.height == c.image_size).ok_or_else(|| {
+                        Error::Data(format!(
+                            "expected images of {0} x {0} from {1:?}, found {2:?}",
+                            c.image_size,
+                            c.cameras,
+                            episode.frames.iter().map(|f| (&f.camera, f.height, f.width)).collect::<Vec<_>>()
+                        ))
+                    })?;
                     for &row in &window.observations[first_image..] {
                         host.push_image(camera, frames.image(row), corner, c.crop_size, None);
                     }
@@ -270,15 +279,27 @@ impl Trainer {
             all.extend(tensors.into_iter().map(|(name, t)| (format!("{part}/{name}"), t)));
         }
         all.insert("step".to_owned(), HostTensor { shape: vec![1], data: vec![self.step as f32] });
-        Ok(e2h_nn::save_weights(path, &all, &std::collections::BTreeMap::new())?)
+        let seal = BTreeMap::from([(SEAL.to_owned(), digest(&all))]);
+        Ok(e2h_nn::save_weights(path, &all, &seal)?)
     }
 
     /// Continues from a file that [`Trainer::save`] wrote.
     ///
     /// # Errors
-    /// When the file is missing or of another network.
+    /// When the file is missing, damaged or of another network.
     pub fn restore(&mut self, path: &Path) -> Result<()> {
-        let (mut all, _) = e2h_nn::load_weights(path)?;
+        let (mut all, metadata) = e2h_nn::load_weights(path)?;
+        // States of version 0.1 have none.
+        if let Some(expected) = metadata.get(SEAL) {
+            let found = digest(&all);
+            if *expected != found {
+                let problem = format!(
+                    "damaged: expected SHA-256 {}, found {found}; remove the file to train this stage from its beginning",
+                    e2h_core::one_line(expected)
+                );
+                return Err(Error::Checkpoint { path: path.to_owned(), problem });
+            }
+        }
         let step = all.remove("step").and_then(|t| t.data.first().copied());
         let step = step.ok_or_else(|| Error::Checkpoint {
             path: path.to_owned(),

@@ -6,8 +6,8 @@ use e2h_core::{Direction, Episode, Image, Observation, Origin, Outcome, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_nn::{Compute, Precision, candle_operations};
 use e2h_policy::{
-    CriticConfig, DiffusionPolicy, PolicyConfig, Prediction, ScheduleConfig, ScheduleKind, TrainConfig,
-    Trainer, TrainingData, train_critic,
+    CriticConfig, DiffusionPolicy, PolicyConfig, Prediction, ScheduleConfig, ScheduleKind, ScheduledAdam,
+    TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::cell::Cell;
 use std::sync::Arc;
@@ -67,7 +67,7 @@ fn train_config() -> TrainConfig {
         conditioning_dropout: 0.2,
         observation_noise: 0.05,
         keypoint_sharpness: 1.0,
-        adam: e2h_nn::AdamConfig { clip_norm: Some(1.0), ..Default::default() },
+        adam: ScheduledAdam { clip_norm: Some(1.0), ..Default::default() },
         schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 1e-3, warmup: 2 },
         ema: e2h_nn::EmaConfig::default(),
     }

@@ -6,7 +6,7 @@ use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_policy::{
     Checkpoint, CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind,
-    TrainConfig, Trainer, TrainingData, train_critic,
+    ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ fn train_config() -> TrainConfig {
         conditioning_dropout: 0.0,
         observation_noise: 0.0,
         keypoint_sharpness: 1.0,
-        adam: e2h_nn::AdamConfig { clip_norm: Some(1.0), ..Default::default() },
+        adam: ScheduledAdam { clip_norm: Some(1.0), ..Default::default() },
         schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 2e-3, warmup: 10 },
         ema: e2h_nn::EmaConfig::default(),
     }
@@ -141,7 +141,7 @@ fn a_checkpoint_of_impossible_numbers_is_refused() {
     assert!(refusal(dims, "\"down_dims\":[1048576,1048576]").contains("of another shape"));
     assert!(refusal(dims, "\"down_dims\":[72057594037927936]").contains("1 to 16 sizes"));
     assert!(refusal("\"horizon\":16", "\"horizon\":1152921504606846976").contains("horizon"));
-    assert!(refusal("\"guidance\":1.0", "\"guidance\":1e39").contains("guidance: expected a number"));
+    assert!(refusal("\"guidance\":1.0", "\"guidance\":1e39").contains("guidance: expected 0 to 100"));
     let range = "\"state_max\":[1.0,";
     assert!(refusal(range, "\"state_max\":[-1.0,").contains("state entry 0: expected finite ends"));
     assert!(refusal(range, "\"state_max\":[1e39,").contains("state entry 0"));
@@ -180,6 +180,17 @@ fn training_goes_on_from_a_saved_state_with_the_same_bytes() {
         second.step(&data).unwrap();
     }
     assert_eq!(whole.weights().unwrap(), second.weights().unwrap());
+
+    // One bit of one number.
+    let mut bytes = std::fs::read(&path).unwrap();
+    let last = bytes.len() - 9;
+    bytes[last] ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+    let message = new().restore(&path).unwrap_err().to_string();
+    assert!(
+        message.contains("damaged: expected SHA-256") && message.contains("training.safetensors"),
+        "{message}"
+    );
 }
 
 #[test]

@@ -1,6 +1,6 @@
 use crate::motion::episode_speeds;
 use crate::series::{moving_average, percentile, runs};
-use crate::{Error, Fate, Refined, Result};
+use crate::{Error, Fate, Refined, Result, limits};
 use e2h_core::Episode;
 use serde::{Deserialize, Serialize};
 use std::borrow::Borrow;
@@ -42,11 +42,13 @@ impl AdvantageConfig {
                 problems.push(format!("{name}: expected 0 to {most}, got {value}"));
             }
         }
-        if self.smooth.is_multiple_of(2) {
-            problems.push(format!("smooth: expected an odd number of frames, got {}", self.smooth));
+        for (name, value, least) in
+            [("smooth", self.smooth, 1), ("min_run", self.min_run, 0), ("horizon", self.horizon, 1)]
+        {
+            problems.extend(limits::frames(name, value, least));
         }
-        if self.horizon == 0 {
-            problems.push("horizon: expected at least 1 control step, got 0".to_owned());
+        if self.smooth > 0 && self.smooth.is_multiple_of(2) {
+            problems.push(format!("smooth: expected an odd number of frames, got {}", self.smooth));
         }
         problems
     }

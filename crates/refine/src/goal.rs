@@ -1,4 +1,4 @@
-use crate::percentile;
+use crate::{limits, percentile};
 use e2h_core::Episode;
 use serde::{Deserialize, Serialize};
 
@@ -25,6 +25,18 @@ pub struct GoalConfig {
 impl Default for GoalConfig {
     fn default() -> Self {
         Self { enabled: false, percentile: 50.0, least: 0.005 }
+    }
+}
+
+impl GoalConfig {
+    /// All problems with the values.
+    #[must_use]
+    pub fn validate(&self) -> Vec<String> {
+        let mut problems: Vec<String> = limits::amount("least", self.least, true).into_iter().collect();
+        if !(0.0..=100.0).contains(&self.percentile) {
+            problems.push(format!("percentile: expected 0 to 100, got {}", self.percentile));
+        }
+        problems
     }
 }
 

@@ -1,4 +1,4 @@
-use crate::ReverseConfig;
+use crate::{ReverseConfig, limits};
 use e2h_core::Episode;
 use serde::{Deserialize, Serialize};
 
@@ -48,10 +48,20 @@ impl Default for GateConfig {
 }
 
 impl GateConfig {
-    /// Problems with the values; none at present, any count can be asked for.
+    /// All problems with the values.
     #[must_use]
     pub fn validate(&self) -> Vec<String> {
-        vec![]
+        let counts = [("closings", self.closings), ("openings", self.openings)];
+        let mut problems: Vec<String> =
+            counts.into_iter().filter_map(|(name, n)| limits::frames(name, n, 0)).collect();
+        // Between two closings there is an opening: other counts would accept nothing.
+        if self.closings.abs_diff(self.openings) > 1 {
+            problems.push(format!(
+                "closings, openings: expected counts that differ by at most 1, got {} and {}",
+                self.closings, self.openings
+            ));
+        }
+        problems
     }
 }
 

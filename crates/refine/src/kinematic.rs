@@ -4,7 +4,7 @@ use crate::retime::{Node, retime};
 use crate::reverse::goals;
 use crate::smooth::smooth;
 use crate::still::still_runs;
-use crate::{Fate, Refined, ReverseConfig};
+use crate::{Fate, Refined, ReverseConfig, limits};
 use e2h_core::{CONTROL_HZ, Episode, Pose};
 use serde::{Deserialize, Serialize};
 
@@ -121,10 +121,16 @@ impl KinematicConfig {
             ("resample_step", self.resample_step, false),
             ("resample_rotation", self.resample_rotation, true),
         ] {
-            if !(value.is_finite() && (value > 0.0 || (zero && value == 0.0))) {
-                let least = if zero { "at least 0" } else { "more than 0" };
-                problems.push(format!("{name}: expected {least}, got {value}"));
-            }
+            problems.extend(limits::amount(name, value, zero));
+        }
+        for (name, value, least) in [
+            ("static_frames", self.static_frames, 1),
+            ("protect_frames", self.protect_frames, 0),
+            ("slow_min_frames", self.slow_min_frames, 0),
+            ("speed_window", self.speed_window, 0),
+            ("smooth_frames", self.smooth_frames, 0),
+        ] {
+            problems.extend(limits::frames(name, value, least));
         }
         if self.slow_speed < self.static_speed {
             problems.push(format!(

@@ -32,6 +32,7 @@ mod fixture;
 mod goal;
 mod gripper;
 mod kinematic;
+mod limits;
 mod motion;
 mod resample;
 mod retime;

@@ -1,4 +1,5 @@
 use crate::gripper::open_states;
+use crate::limits;
 use e2h_core::{Action, Episode, Excursion, Pose};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -56,12 +57,9 @@ impl ReverseConfig {
     #[must_use]
     pub fn validate(&self) -> Vec<String> {
         let mut problems = vec![];
-        if self.lookahead == 0 {
-            problems.push("lookahead: expected at least 1 control step, got 0".to_owned());
-        }
-        if !(self.open_width_m > 0.0 && self.open_width_m.is_finite()) {
-            problems.push(format!("open_width_m: expected a positive opening, m, got {}", self.open_width_m));
-        }
+        problems.extend(limits::frames("lookahead", self.lookahead, 1));
+        problems.extend(limits::frames("labels_fade", self.labels_fade, 0));
+        problems.extend(limits::amount("open_width_m", self.open_width_m, false));
         if !(0.0 < self.close_at && self.close_at <= self.open_at && self.open_at < 1.0) {
             problems.push(format!(
                 "close_at, open_at: expected 0 < close_at <= open_at < 1, got {} and {}",

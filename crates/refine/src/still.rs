@@ -39,6 +39,7 @@ pub(crate) fn still_runs(
         }
         found.push(start..run.end);
     }
-    found.retain(|run| run.len() > config.static_frames);
+    // Nothing lies between the ends of a run of two.
+    found.retain(|run| run.len() > config.static_frames.max(2));
     found
 }

@@ -1,6 +1,6 @@
 use crate::advantage::{check_values, split};
 use crate::series::runs;
-use crate::{Fate, Refined, Result};
+use crate::{Fate, Refined, Result, limits};
 use e2h_core::Episode;
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,8 @@ pub struct SuffixConfig {
     pub frames: usize,
     /// Frames kept after those.
     pub keep: usize,
-    /// With fewer successful hard rollouts in the iteration the value is not trusted; for the caller, who counts them.
+    /// With fewer successful hard rollouts in the iteration the value is not trusted, and nothing is cut; for the caller, who
+    /// counts them ([`SuffixConfig::trusting`]).
     pub min_successes: usize,
 }
 
@@ -31,13 +32,21 @@ impl SuffixConfig {
     #[must_use]
     pub fn validate(&self) -> Vec<String> {
         let mut problems = vec![];
-        if !self.value.is_finite() {
-            problems.push(format!("value: expected a finite number, got {}", self.value));
+        if !(-1.0..=1.0).contains(&self.value) {
+            problems.push(format!("value: expected -1 to 1, as values are, got {}", self.value));
         }
-        if self.frames == 0 {
-            problems.push("frames: expected at least 1, got 0".to_owned());
+        for (name, value, least) in
+            [("frames", self.frames, 1), ("keep", self.keep, 0), ("min_successes", self.min_successes, 0)]
+        {
+            problems.extend(limits::frames(name, value, least));
         }
         problems
+    }
+
+    /// The same for a critic that learned from so many successful hard rollouts: off where they are too few to trust it.
+    #[must_use]
+    pub fn trusting(&self, successes: usize) -> Self {
+        Self { enabled: self.enabled && successes >= self.min_successes, ..self.clone() }
     }
 }
 
@@ -82,6 +91,8 @@ mod tests {
         assert_eq!((refined.report.kept, refined.report.after_goal), (45, 15));
         assert!(refined.segments[0].terminal);
         assert_eq!(cut_suffix(&e, &values, &SuffixConfig::default()).unwrap().report.kept, 60);
+        assert_eq!(cut_suffix(&e, &values, &on.trusting(3)).unwrap().report.after_goal, 15);
+        assert_eq!(cut_suffix(&e, &values, &on.trusting(2)).unwrap().report.after_goal, 0);
         values[54..].fill(1.0);
         values[20..30].fill(0.0);
         assert_eq!(cut_suffix(&e, &values, &on).unwrap().report.kept, 60);

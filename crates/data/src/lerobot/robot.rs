@@ -57,8 +57,9 @@ impl ColumnSlice {
         let feature = info.feature(&self.column).filter(|f| !f.is_visual()).ok_or_else(|| {
             let names: Vec<&str> =
                 info.features.iter().filter(|(_, f)| !f.is_visual()).map(|(n, _)| n.as_str()).collect();
-            let nearest = e2h_core::nearest(&self.column, names).unwrap_or_default();
-            column_error(&self.column, format!("a column of numbers, perhaps `{nearest}`"), "none")
+            let perhaps = e2h_core::nearest(&self.column, names).map(|n| format!(", perhaps `{n}`"));
+            let perhaps = perhaps.unwrap_or_default();
+            column_error(&self.column, format!("a column of numbers{perhaps}"), "none")
         })?;
         let end = self.end.unwrap_or_else(|| feature.width());
         if end > feature.width() {

@@ -198,13 +198,14 @@ mod tests {
     fn the_command_says_what_differs_and_makes_the_same_configuration() {
         let plain = "cargo run --release --example nut_assembly -- --preset laptop --seed 7";
         assert_eq!(command(&provenance(&[])), plain);
-        let made = command(&provenance(&["loop.cycles=3", "task.variant=square", "train.step.adam.lr=0.5"]));
+        let made =
+            command(&provenance(&["loop.cycles=3", "task.variant=square", "train.step.schedule.lr=0.5"]));
         assert!(made.starts_with(plain), "{made}");
         let set: Vec<String> =
             made.split(" --set '").skip(1).map(|s| s.trim_end_matches('\'').to_owned()).collect();
         assert_eq!(set.len(), 3, "{made}");
         let again = RunConfig::resolve("laptop", "nut_assembly", &set).unwrap().config;
-        let wanted = provenance(&["loop.cycles=3", "task.variant=square", "train.step.adam.lr=0.5"]).run;
+        let wanted = provenance(&["loop.cycles=3", "task.variant=square", "train.step.schedule.lr=0.5"]).run;
         assert_eq!(serde_json::to_value(again).unwrap(), wanted);
     }
 

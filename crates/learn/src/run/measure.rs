@@ -2,7 +2,7 @@
 
 use super::{Accepted, AcceptedNotes, Base, Run, TrainNotes, folder, now};
 use crate::Result;
-use crate::evaluate::{Filming, evaluate};
+use crate::evaluate::{Filmed, Filming, evaluate};
 use crate::picture;
 use crate::record::{IterationRecord, RunResults};
 use crate::report;
@@ -31,7 +31,7 @@ impl Run {
         let c = self.config();
         let e = &c.evaluation;
         let envs = self.envs(e.parallel.min(e.trials))?;
-        let filming = Filming { trials: (0..e.filmed).collect(), camera: "table".to_owned(), size: 160 };
+        let filming = Filming { trials: Filmed::First(e.filmed), camera: "table".to_owned(), size: 160 };
         let filming = (e.filmed > 0).then_some(&filming);
         let done = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, filming, &self.progress)?;
         let evaluation = done.evaluation;

@@ -41,6 +41,37 @@ impl Default for AdamConfig {
     }
 }
 
+impl AdamConfig {
+    /// Largest weight decay that is taken for one.
+    const MOST_DECAY: f32 = 10.0;
+
+    /// # Errors
+    /// [`Error::Config`] names the first setting that does not work.
+    pub fn validate(&self) -> Result<()> {
+        let fail =
+            |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
+        if !(self.lr > 0.0 && self.lr.is_finite()) {
+            return fail("lr", "a finite number more than 0", self.lr);
+        }
+        for (what, beta) in [("beta1", self.beta1), ("beta2", self.beta2)] {
+            if !(0.0..1.0).contains(&beta) {
+                return fail(what, "a number in [0, 1)", beta);
+            }
+        }
+        // At 0 a weight whose gradient has always been 0 is divided by 0.
+        if !(self.eps > 0.0 && self.eps <= 1.0) {
+            return fail("eps", "more than 0 and at most 1", self.eps);
+        }
+        if !(0.0..=Self::MOST_DECAY).contains(&self.weight_decay) {
+            return fail("weight_decay", "a number from 0 to 10", self.weight_decay);
+        }
+        if let Some(max) = self.clip_norm.filter(|c| !(*c > 0.0 && *c <= 1e9)) {
+            return fail("clip_norm", "more than 0 and at most 1e9", max);
+        }
+        Ok(())
+    }
+}
+
 /// Adam or AdamW, in one pass over the memory.
 ///
 /// # Source
@@ -64,21 +95,7 @@ impl Adam {
     /// # Errors
     /// [`Error::Config`] names the first setting that does not work; [`Error::Candle`] when a device fails.
     pub fn new(config: &AdamConfig, params: &Params) -> Result<Self> {
-        let fail =
-            |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
-        for (what, beta) in [("beta1", config.beta1), ("beta2", config.beta2)] {
-            if !(0.0..1.0).contains(&beta) {
-                return fail(what, "a number in [0, 1)", beta);
-            }
-        }
-        for (what, v) in [("eps", config.eps), ("weight_decay", config.weight_decay)] {
-            if !(0.0..f32::INFINITY).contains(&v) {
-                return fail(what, "a finite number from 0 on", v);
-            }
-        }
-        if let Some(max) = config.clip_norm.filter(|c| c.is_nan() || *c <= 0.0) {
-            return fail("clip_norm", "a positive number", max);
-        }
+        config.validate()?;
         let zeros: Result<Vec<Numbers>> =
             params.variables().map(|v| Numbers::zeros(v, params.in_graph())).collect();
         let mean = zeros?;

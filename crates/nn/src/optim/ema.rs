@@ -22,6 +22,21 @@ impl Default for EmaConfig {
 }
 
 impl EmaConfig {
+    /// # Errors
+    /// [`Error::Config`] names the first setting that does not work.
+    pub fn validate(&self) -> Result<()> {
+        let fail =
+            |what, expected, found: f32| Err(Error::Config { what, expected, found: found.to_string() });
+        if !(self.power > 0.0 && self.power <= 100.0) {
+            return fail("power", "more than 0 and at most 100", self.power);
+        }
+        // At 1 the average would stay where it began.
+        if !(0.0..1.0).contains(&self.max) {
+            return fail("max", "a number in [0, 1)", self.max);
+        }
+        Ok(())
+    }
+
     /// The share of the old average that update number `step` (from 0) keeps: 1 - (1 + step)^-power, between 0 and `max`.
     ///
     /// # Source
@@ -48,8 +63,9 @@ impl Ema {
     /// An average that starts at the present weights.
     ///
     /// # Errors
-    /// [`Error::Candle`] when a variable cannot be read.
+    /// [`Error::Config`] when a setting does not work; [`Error::Candle`] when a variable cannot be read.
     pub fn new(config: &EmaConfig, params: &Params) -> Result<Self> {
+        config.validate()?;
         let average: Result<_> = params.variables().map(|v| Numbers::copy(v, params.in_graph())).collect();
         Ok(Self { config: *config, params: params.clone(), average: average?, updates: 0 })
     }

@@ -197,8 +197,9 @@ impl CriticSettings {
 fn slot<'a>(table: &'a mut Value, key: &str, value: &Value) -> Result<&'a mut Value> {
     let (group, name) = key.split_once('.').unwrap_or((key, ""));
     let unknown = |known: &Map<String, Value>, word: &str, prefix: &str| {
-        let near = nearest(word, known.keys().map(String::as_str)).unwrap_or_default().to_owned();
-        anyhow::anyhow!("--set: unknown key `{key}`; did you mean `{prefix}{near}`?")
+        let near = nearest(word, known.keys().map(String::as_str));
+        let near = near.map(|near| format!("; did you mean `{prefix}{near}`?")).unwrap_or_default();
+        anyhow::anyhow!("--set: unknown key `{key}`{near}")
     };
     let groups = table.as_object_mut().context("the configuration is a table")?;
     if !groups.contains_key(group) {

@@ -265,9 +265,9 @@ impl Judge {
                 values.push(self.values(segment, &recording, source)?);
             }
         }
-        let mut suffix = config.suffix_at(a.fps);
-        if suffix.enabled && self.about.successes < suffix.min_successes {
-            suffix.enabled = false;
+        let asked = config.suffix_at(a.fps);
+        let suffix = asked.trusting(self.about.successes);
+        if suffix.enabled != asked.enabled {
             let (found, needed) = (self.about.successes, suffix.min_successes);
             say(a, format_args!("suffix: not cut, the critic has seen {found} successes of {needed}"));
         }

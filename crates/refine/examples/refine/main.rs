@@ -30,6 +30,7 @@ use std::path::PathBuf;
 
 /// Reverses and filters a dataset of easy-direction episodes.
 #[derive(Parser)]
+#[command(version)]
 struct Arguments {
     /// LeRobotDataset v3.0 with episodes of the easy task.
     #[arg(long, value_name = "DIR")]
@@ -92,7 +93,11 @@ struct Plan {
     account: Account,
 }
 
-fn main() -> Result<()> {
+fn main() -> Result<(), e2h_core::Failure> {
+    Ok(program()?)
+}
+
+fn program() -> Result<()> {
     let a = Arguments::parse();
     let dataset = Dataset::open(&a.dataset)?;
     let columns = columns(&a)?;
@@ -190,10 +195,8 @@ fn cameras(a: &Arguments, info: &Info) -> Result<Vec<(String, Feature)>> {
     let find = |name: &String| {
         all.iter().find(|(n, _)| n == name).cloned().with_context(|| {
             let names = all.iter().map(|(n, _)| n.as_str());
-            format!(
-                "--camera {name}: no such column, perhaps `{}`",
-                e2h_core::nearest(name, names).unwrap_or_default()
-            )
+            let perhaps = e2h_core::nearest(name, names).map(|n| format!(", perhaps `{n}`"));
+            format!("--camera {name}: no such column{}", perhaps.unwrap_or_default())
         })
     };
     a.camera.iter().map(find).collect()

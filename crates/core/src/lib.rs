@@ -20,7 +20,7 @@ mod spelling;
 mod traits;
 
 pub use episode::{Action, Direction, Episode, Frames, Image, Kind, Observation, Origin, Outcome, State};
-pub use pose::{Pose, align_hemisphere};
+pub use pose::{Pose, align_hemisphere, continue_signs};
 pub use random::{Rng, stream};
 pub use spelling::{nearest, one_line};
 pub use traits::{ActionChunk, Policy, Value};

@@ -173,8 +173,7 @@ impl DatasetSource {
 
     fn cameras(&self, index: usize, recording: &mut Recording) {
         for (name, feature) in &self.dataset.info().features {
-            let ([height, width, _], true) = (&feature.shape[..], feature.is_visual()) else { continue };
-            let (height, width) = (*height, *width);
+            let Some((height, width)) = feature.image_size() else { continue };
             // A video without its decoder is no reason to show nothing at all.
             match self.dataset.read_columns(index, &[name.as_str()]).map(|t| t.columns) {
                 Ok(mut columns) => {

@@ -257,7 +257,7 @@ fn features(a: &Arguments, info: &Info, cameras: &[(String, Feature)]) -> Result
     }
     let mut features = vec![("observation.state".to_owned(), Feature::vector(&names))];
     for (name, feature) in cameras {
-        let [height, width, _] = feature.shape[..] else { bail!("{name}: expected an image") };
+        let Some((height, width)) = feature.image_size() else { bail!("{name}: expected an image") };
         features.push((name.clone(), Feature::image(height, width)));
     }
     features.push(("action".to_owned(), Feature::vector(&ACTION_NAMES)));

@@ -256,7 +256,7 @@ mod tests {
         for name in ["", "../a", ".a", "a/b", "a b"] {
             assert!(matches!(store.write(name, &episode(1)), Err(Error::Name { .. })), "{name}");
         }
-        assert!(matches!(store.read("missing"), Err(Error::Io { action: "read", .. })));
+        assert!(matches!(store.read("missing"), Err(Error::Io { action: "open", .. })));
     }
 
     proptest! {

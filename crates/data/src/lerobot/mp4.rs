@@ -332,9 +332,9 @@ pub(crate) mod tests {
         let n = ticks.len() as u32;
         let times: Vec<u32> = ticks.iter().flat_map(|&t| [1, t]).collect();
         let stts = table(b"stts", &[&[0, n][..], &times].concat());
-        let stsz = table(b"stsz", &[0, 5, n]);
+        let stsz = table(b"stsz", &[0, 500, n]);
         let ftyp = boxed(b"ftyp", b"isom");
-        let mdat = boxed(b"mdat", &vec![7; 5 * n as usize]);
+        let mdat = boxed(b"mdat", &vec![7; 500 * n as usize]);
         let stsc = table(b"stsc", &[0, 1, 1, n, 1]);
         let stco = table(b"stco", &[0, 1, ftyp.len() as u32 + 8]);
         let stbl = boxed(b"stbl", &[stts, stsz, stsc, stco].concat());
@@ -377,7 +377,7 @@ pub(crate) mod tests {
             let error = read(&whole[..length]).unwrap_err();
             assert!(!error.is_unsupported(), "{length}: {error}");
         }
-        let lies = [&whole[..12], &whole[12 + 208..]].concat();
+        let lies = [&whole[..12], &whole[12 + 8 + 500 * 40..]].concat();
         assert!(read(&lies).unwrap_err().to_string().contains("frames up to byte"), "no frames in it");
     }
 

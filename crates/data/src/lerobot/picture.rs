@@ -144,6 +144,28 @@ mod tests {
         assert!(from(b"\xff\xd8\xff\xe0 JFIF", 4, 6).is_err());
     }
 
+    /// Made with Pillow 12: `Image.new("RGB", (12, 8), (200, 100, 50)).save("plain.jpg", quality=90)`.
+    #[test]
+    fn jpeg_files_are_read_and_other_formats_are_named() {
+        let file = include_bytes!("../../../../tests/golden/lerobot/packed/plain.jpg");
+        let pixels = from(file, 8, 12).unwrap();
+        assert_eq!(pixels.len(), 8 * 12 * 3);
+        for pixel in pixels.chunks_exact(3) {
+            assert!(pixel.iter().zip([200_u8, 100, 50]).all(|(a, b)| a.abs_diff(b) < 4), "{pixel:?}");
+        }
+        let other = from(file, 12, 8).unwrap_err();
+        assert!(!other.is_unsupported(), "{other}");
+        for length in 0..file.len() {
+            // What is cut off in the middle of its pixels may be an image all the same, of the size that is asked for.
+            if let Ok(pixels) = from(&file[..length], 8, 12) {
+                assert_eq!(pixels.len(), 8 * 12 * 3);
+            }
+        }
+        let webp = from(b"RIFF\x24\0\0\0WEBPVP8 ", 8, 12).unwrap_err();
+        assert!(webp.is_unsupported() && webp.to_string().contains("found a WebP file"), "{webp}");
+        assert!(!from(b"nothing", 8, 12).unwrap_err().is_unsupported());
+    }
+
     #[test]
     fn other_kinds_of_png_become_rgb() {
         for (kind, depth, data) in [

@@ -2,7 +2,7 @@
 
 use super::dataset::{Dataset, LARGEST_JSON, info_path, read_info};
 use super::episodes::{self, EpisodeSpan};
-use super::feature::{Dtype, Features, Info};
+use super::feature::{DEFAULT_FEATURES, Dtype, Features, Info};
 use super::mp4::Times;
 use super::parquet_file::{ParquetFile, plain, replace_columns};
 use super::stats::{self, QUANTILES, Stats};
@@ -386,6 +386,10 @@ impl Checker {
         let stored = stored(dataset.info());
         let names: Vec<&str> = stored.iter().map(|(n, _)| n.as_str()).collect();
         let table = dataset.read_columns(episode, &names).or_else(|e| {
+            // The file as a whole: said once.
+            if e.is_unsupported() && dataset.read_columns(episode, &["timestamp"]).is_err() {
+                return Err(e);
+            }
             // Each by itself: what is damaged in one column is to be found beside what is not supported in another.
             let mut table = Table { rows: span.length, columns: vec![] };
             let mut blamed = false;
@@ -407,8 +411,13 @@ impl Checker {
         });
         let table = match table {
             Ok(table) => table,
+            Err(e) if e.is_unsupported() && !self.unsupported.insert(e.to_string()) => return,
             Err(e) => return self.error(&path, &e, Some(episode), true),
         };
+        // Said already.
+        if DEFAULT_FEATURES.iter().any(|(name, _)| table.column(name).is_none()) {
+            return;
+        }
         if let Err(e) = check_rows(dataset, episode, span, &table) {
             if !e.is_unsupported() || self.unsupported.insert(e.to_string()) {
                 self.error(&path, &e, Some(episode), true);

@@ -378,7 +378,7 @@ pub(crate) mod tests {
             assert!(!error.is_unsupported(), "{length}: {error}");
         }
         let lies = [&whole[..12], &whole[12 + 8 + 500 * 40..]].concat();
-        assert!(read(&lies).unwrap_err().to_string().contains("frames up to byte"), "no frames in it");
+        assert!(read(&lies).unwrap_err().to_string().contains("frames of 500 bytes"), "no frames in it");
     }
 
     #[test]

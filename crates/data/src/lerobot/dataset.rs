@@ -232,8 +232,8 @@ impl Dataset {
         let [(_, Column::F32(times))] = &columns[..] else { return Ok(()) };
         for (row, &found) in times.iter().enumerate() {
             let expected = row as f64 / self.info.fps;
-            // Not `>=`: what is no number is off the grid too.
-            if !((f64::from(found) - expected).abs() < 0.5 / self.info.fps) {
+            let off = (f64::from(found) - expected).abs();
+            if off.is_nan() || off >= 0.5 / self.info.fps {
                 let what = format!("column `timestamp`, row {}", rows.start + row);
                 let expected = format!("within half a frame of {expected} s");
                 return Err(file_error(&file.path, &what, expected, found.to_string()));

@@ -236,10 +236,8 @@ fn plan(
         }
     }
     let judged = info.feature("next.success").is_some_and(|f| f.dtype == Dtype::Bool);
-    if judged {
-        if !names.contains(&"next.success") {
-            names.push("next.success");
-        }
+    if judged && !names.contains(&"next.success") {
+        names.push("next.success");
     }
     let table = dataset.read_columns(episode, &names)?;
     // What is taken over as it is is looked at too, before any row is written.

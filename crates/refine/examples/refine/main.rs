@@ -231,6 +231,7 @@ fn plan(
     let (info, fps) = (dataset.info(), a.fps);
     let mut names = columns.names();
     for slice in &a.state {
+        slice.width(info)?;
         if !names.contains(&slice.column.as_str()) {
             names.push(&slice.column);
         }

@@ -299,7 +299,24 @@ def train(root):
     print(f"LeRobot trained on inputs {sorted(inputs)}: losses {[round(v, 3) for v in losses]}")
 
 
+def edit(root, out):
+    """What LeRobot's own tools make of a dataset: two merged, one episode deleted, one split in two."""
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+
+    source, out = LeRobotDataset("local/source", root=root), Path(out)
+    out.mkdir()
+    merge_datasets([source, source], output_repo_id="local/merged", output_dir=out / "merged")
+    delete_episodes(source, [0], output_dir=out / "deleted", repo_id="local/deleted")
+    split_dataset(source, {"first": [0], "rest": list(range(1, source.num_episodes))}, output_dir=out / "split")
+    # A split is a folder of datasets; run.sh looks at each.
+    for part in (out / "split").iterdir():
+        part.rename(out / f"split-{part.name}")
+    (out / "split").rmdir()
+    print("LeRobot made", sorted(p.name for p in out.iterdir()))
+
+
 COMMANDS = {
+    "edit": edit,
     "compare": compare, "statistics": statistics, "append": append, "windows": windows, "train": train,
     "refined": refined, "video": video,
     "foreign": lambda root: foreign(root, False), "foreign-video": lambda root: foreign(root, True),

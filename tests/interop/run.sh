@@ -86,6 +86,15 @@ else
     echo "NOT RUN: no ffmpeg to decode the video with"
 fi
 
+echo "== LeRobot merges, deletes and splits; no row is lost, and a repair takes places and statistics anew"
+lerobot edit "$work/theirs" "$work/edited"
+for edited in "$work/edited"/*; do
+    status=0; "$programs/dataset" check "$edited" || status=$?
+    test "$status" = 0 -o "$status" = 3
+    "$programs/dataset" check "$edited" --repair
+    lerobot compare "$programs/interop" "$edited"
+done
+
 echo "== a policy trained here opens in LeRobot"
 "$programs/lerobot_actions" make "$work/policy"
 "$programs/export" --checkpoint "$work/policy" --lerobot "$work/published"

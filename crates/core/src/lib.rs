@@ -24,7 +24,7 @@ pub use episode::{
     Action, Direction, Episode, Excursion, Frames, Image, Kind, Observation, Origin, Outcome, State,
 };
 pub use failure::Failure;
-pub use pose::{Pose, align_hemisphere};
+pub use pose::{Pose, align_hemisphere, continue_signs};
 pub use random::{Rng, stream};
 pub use spelling::{nearest, one_line};
 pub use traits::{ActionChunk, Policy, Value};

@@ -57,6 +57,28 @@ pub fn align_hemisphere(q: [f64; 4], reference: &[f64; 4]) -> [f64; 4] {
     if dot < 0.0 { q.map(|v| -v) } else { q }
 }
 
+/// Continues the sign of quaternions (wxyz) along a path: the first goes into the hemisphere of `reference`, each other into
+/// that of the one before it. A fixed reference would make a hand that turns past 180 degrees jump from q to -q.
+///
+/// # Shapes
+/// `rows` are any rows; `entries` says where the four numbers of a quaternion lie in each.
+pub fn continue_signs<const N: usize>(
+    rows: &mut [[f32; N]],
+    entries: std::ops::Range<usize>,
+    reference: &[f64; 4],
+) {
+    let mut before = *reference;
+    for row in rows {
+        let Some(q) = row.get_mut(entries.clone()) else { return };
+        if q.iter().zip(before).map(|(a, b)| f64::from(*a) * b).sum::<f64>() < 0.0 {
+            q.iter_mut().for_each(|v| *v = -*v);
+        }
+        for (slot, v) in before.iter_mut().zip(q) {
+            *slot = f64::from(*v);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

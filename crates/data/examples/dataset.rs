@@ -5,12 +5,13 @@
 //! cargo run --release --example dataset -- check recordings/unplug --repair
 //! ```
 //!
-//! Ends with status 1 when faults are left.
+//! Ends with status 0 for a sound dataset, 1 for one that is damaged or cannot be read at all, 3 where something beside the rows
+//! is stale (the rows are whole), 4 where something is not supported here (nothing is known of it, and `--repair` touches nothing).
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
-use e2h_data::lerobot::{REMOVED, Report, check, repair};
+use e2h_data::lerobot::{FaultKind, REMOVED, Report, check, repair};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -24,11 +25,12 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Reads every row and image; compares counts, types, ranges and checksums.
+    /// Reads every row and image and the tables of videos; compares counts, types, ranges, times and checksums.
     Check {
         /// The dataset's folder.
         dir: PathBuf,
-        /// Cut it off after the last whole episode and remove what nothing counts; what is removed is kept in DIR/removed.
+        /// Where there is damage, cut off after the last whole episode and remove what nothing counts; take anew from the rows
+        /// what is stale. What was there before is kept in DIR/removed. Where something is not supported, nothing is touched.
         #[arg(long)]
         repair: bool,
         /// Print one JSON line and nothing else.
@@ -49,7 +51,12 @@ fn program() -> Result<ExitCode> {
     } else {
         print(&report, mend);
     }
-    Ok(if report.is_sound() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(ExitCode::from(match report.worst() {
+        None => 0,
+        Some(FaultKind::Damage) => 1,
+        Some(FaultKind::Stale) => 3,
+        Some(FaultKind::Unsupported) => 4,
+    }))
 }
 
 fn print(report: &Report, mend: bool) {
@@ -57,8 +64,12 @@ fn print(report: &Report, mend: bool) {
         println!("repaired: {line}");
     }
     for fault in &report.faults {
-        let episode = fault.episode.map_or_else(String::new, |e| format!(" (from episode {e} on)"));
-        println!("fault{episode}: {}", fault.message);
+        let episode = match (fault.kind, fault.episode) {
+            (FaultKind::Damage, Some(e)) => format!(" (from episode {e} on)"),
+            (_, Some(e)) => format!(" (episode {e})"),
+            (_, None) => String::new(),
+        };
+        println!("{}{episode}: {}", fault.kind, fault.message);
     }
     println!(
         "{}: {} episodes, {} frames, {} whole; checksums of {} files compared, {} files have none",
@@ -71,7 +82,13 @@ fn print(report: &Report, mend: bool) {
     );
     if report.is_sound() {
         println!("sound");
-    } else if !mend && report.whole > 0 && report.faults.iter().any(|f| f.repairable) {
-        println!("--repair keeps {} episodes and puts the rest into {REMOVED}/", report.whole);
+    } else if report.has(FaultKind::Unsupported) {
+        println!("not all of it can be read here, so nothing is known of the rest; --repair touches nothing");
+    } else if !mend && report.has(FaultKind::Damage) {
+        if report.whole > 0 && report.faults.iter().any(|f| f.kind == FaultKind::Damage && f.repairable) {
+            println!("--repair keeps {} episodes and puts the rest into {REMOVED}/", report.whole);
+        }
+    } else if !mend {
+        println!("the rows are whole; --repair takes anew from them what is stale");
     }
 }

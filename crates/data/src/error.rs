@@ -99,9 +99,36 @@ pub enum Error {
         /// What there is.
         found: String,
     },
+    /// A file may be whole, but holds what is not read here.
+    #[error("{}: {what}: expected {expected}, found {found}: not supported here", path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// Which part of it.
+        what: String,
+        /// What is read here.
+        expected: String,
+        /// What is there.
+        found: String,
+    },
     /// There is nothing to draw from.
     #[error("sampler: expected windows in at least one set, found none")]
     NoWindows,
+}
+
+impl Error {
+    /// True where what was found may be whole, and is only not read here or now: an unknown format, a missing decoder, a file
+    /// that may not be opened. False for damage, a missing file included.
+    #[must_use]
+    pub fn is_unsupported(&self) -> bool {
+        match self {
+            Self::Unsupported { .. } | Self::Video { .. } => true,
+            Self::Io { source, .. } => {
+                !matches!(source.kind(), std::io::ErrorKind::NotFound | std::io::ErrorKind::UnexpectedEof)
+            }
+            _ => false,
+        }
+    }
 }
 
 /// Shorthand for a result with this crate's [`enum@Error`].

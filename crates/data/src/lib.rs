@@ -42,6 +42,7 @@ mod window;
 pub use atomic::write as write_atomic;
 pub use crop::Crop;
 pub use error::{Error, Result};
+pub use file::read_regular;
 pub use normalise::{Normaliser, NormaliserConfig};
 pub use resize::resize_image;
 pub use sample::{Pick, Sampler, Set};

@@ -1,13 +1,15 @@
 use crate::atomic::{io, persist, unfinished};
-use crate::file::{WHOLE, decode, encode, file_error, header};
+use crate::file::{WHOLE, decode, encode, file_error, header, open_regular, read_regular};
 use crate::{Error, Result};
 use e2h_core::{Episode, Origin, Outcome};
-use std::fs::{self, File};
+use std::fs;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use tempfile::NamedTempFile;
 
 const SUFFIX: &str = ".safetensors";
+/// Size of one episode, bytes: an hour of two cameras of 480 x 640.
+const LARGEST: u64 = 1 << 38;
 
 /// A folder of episodes, one safetensors file each.
 ///
@@ -80,7 +82,7 @@ impl EpisodeStore {
     /// When there is no such file, or it is not the whole file of an episode.
     pub fn read(&self, name: &str) -> Result<Episode> {
         let path = self.path(name)?;
-        decode(&fs::read(&path).map_err(io("read", &path))?, &path)
+        decode(&read_regular(&path, LARGEST)?, &path)
     }
 
     /// Names of the episodes, sorted. Unfinished files of a killed writer are not among them.
@@ -121,7 +123,7 @@ impl EpisodeStore {
     pub fn summary(&self, name: &str) -> Result<Summary> {
         let path = self.path(name)?;
         let read = io("read", &path);
-        let mut file = File::open(&path).map_err(&read)?;
+        let mut file = open_regular(&path)?;
         let length = file.metadata().map_err(&read)?.len();
         // Eight bytes of length, then the header: all that has to be read.
         let mut bytes = vec![0; 8];
@@ -254,7 +256,7 @@ mod tests {
         for name in ["", "../a", ".a", "a/b", "a b"] {
             assert!(matches!(store.write(name, &episode(1)), Err(Error::Name { .. })), "{name}");
         }
-        assert!(matches!(store.read("missing"), Err(Error::Io { action: "read", .. })));
+        assert!(matches!(store.read("missing"), Err(Error::Io { action: "open", .. })));
     }
 
     proptest! {

@@ -2,7 +2,7 @@ use crate::arm::JOINTS;
 use crate::expert::gauss;
 use crate::render::Renderer;
 use crate::{EnvConfig, Error, Result, Sim, Style, Task, logging};
-use e2h_core::{Action, Direction, Image, Observation, Outcome, Pose, Rng, State};
+use e2h_core::{Action, Direction, Image, Observation, Outcome, Pose, Rng, State, align_hemisphere};
 use mujoco_rs::prelude::MjModel;
 use std::sync::Arc;
 
@@ -31,6 +31,9 @@ struct Progress {
     direction: Direction,
     steps: usize,
     held: usize,
+    /// Quaternions (wxyz) of the hand and the object as they were last observed: the next ones are written in their
+    /// hemispheres, so that none jumps to its negative in the middle of an episode.
+    signs: [[f64; 4]; 2],
 }
 
 impl Env {
@@ -75,7 +78,8 @@ impl Env {
     fn with_model(task: Arc<dyn Task>, config: &EnvConfig, model: Arc<MjModel>) -> Result<Self> {
         let sim = Sim::new(model, task.object(), &task.home(), task.posture_pull())?;
         let cameras = if config.cameras { CAMERAS.map(str::to_owned).to_vec() } else { vec![] };
-        let episode = Progress { direction: Direction::Hard, steps: 0, held: 0 };
+        let signs = [task.eef_reference(), task.object_reference()];
+        let episode = Progress { direction: Direction::Hard, steps: 0, held: 0, signs };
         Ok(Self { task, config: config.clone(), cameras, sim, renderer: Renderer::default(), episode })
     }
 
@@ -140,8 +144,10 @@ impl Env {
     /// # Errors
     /// None at present; kept for environments that refuse some states.
     pub fn begin(&mut self, direction: Direction) -> Result<()> {
-        self.episode = Progress { direction, steps: 0, held: 0 };
+        let signs = [self.task.eef_reference(), self.task.object_reference()];
+        self.episode = Progress { direction, steps: 0, held: 0, signs };
         self.sim.begin();
+        self.continue_signs();
         Ok(())
     }
 
@@ -203,8 +209,9 @@ impl Env {
     #[must_use]
     pub fn state(&self) -> State {
         let mut state = State::default();
-        state[..7].copy_from_slice(&self.sim.tcp().to_row(&self.task.eef_reference()));
-        state[7..14].copy_from_slice(&self.sim.object().to_row(&self.task.object_reference()));
+        let [eef, object] = &self.episode.signs;
+        state[..7].copy_from_slice(&self.sim.tcp().to_row(eef));
+        state[7..14].copy_from_slice(&self.sim.object().to_row(object));
         #[allow(clippy::cast_possible_truncation, reason = "recorded states are f32")]
         let opening = self.sim.opening() as f32;
         state[14] = opening;
@@ -225,6 +232,15 @@ impl Env {
         Ok(self.held().or(timeout.then_some(Outcome::Timeout)))
     }
 
+    /// Takes the quaternions as they are now for the hemispheres of the next ones.
+    fn continue_signs(&mut self) {
+        let poses = [self.sim.tcp(), self.sim.object()];
+        for (before, pose) in self.episode.signs.iter_mut().zip(poses) {
+            let q = pose.orientation.quaternion();
+            *before = align_hemisphere([q.w, q.i, q.j, q.k], before);
+        }
+    }
+
     /// Success, if the goal was held long enough up to now.
     pub(crate) fn held(&self) -> Option<Outcome> {
         let Progress { steps, held, .. } = self.episode;
@@ -239,6 +255,7 @@ impl Env {
         let open = action[7] > 0.5;
         self.sim.drive(&goal, open, self.config.max_goal_step_m, self.config.max_goal_step_rad);
         self.episode.steps += 1;
+        self.continue_signs();
         if self.sim.trouble() != trouble || self.sim.time() <= time {
             return Ok(Some(Outcome::Diverged));
         }
@@ -260,8 +277,9 @@ impl Env {
     #[must_use]
     pub fn save(&self) -> Vec<f64> {
         let mut state = self.sim.save();
-        let Progress { direction, steps, held } = self.episode;
+        let Progress { direction, steps, held, signs } = self.episode;
         state.extend([f64::from(u8::from(direction == Direction::Easy)), steps as f64, held as f64]);
+        state.extend(signs.as_flattened());
         state
     }
 
@@ -274,13 +292,15 @@ impl Env {
         if state.len() != expected {
             return Err(Error::State { expected, found: state.len() });
         }
-        let [easy, steps, held] = *self.sim.restore(state)? else {
+        let [easy, steps, held, ref signs @ ..] = *self.sim.restore(state)? else {
             return Err(Error::State { expected, found: state.len() });
         };
+        let signs = signs.to_vec(); // eight numbers: the length was checked
         let direction = if easy > 0.5 { Direction::Easy } else { Direction::Hard };
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saved from usize")]
         let (steps, held) = (steps as usize, held as usize);
-        self.episode = Progress { direction, steps, held };
+        let quaternion = |i: usize| std::array::from_fn(|k| signs[4 * i + k]);
+        self.episode = Progress { direction, steps, held, signs: [quaternion(0), quaternion(1)] };
         Ok(())
     }
 

@@ -104,7 +104,7 @@ impl Run {
     /// run's.
     pub fn open(options: &RunOptions) -> Result<Self> {
         e2h_nn::tune_allocator();
-        let resolved = RunConfig::resolve(&options.preset, &options.task, &options.set)?;
+        let mut resolved = RunConfig::resolve(&options.preset, &options.task, &options.set)?;
         if let Some(n) = options.threads {
             set_threads(n)?;
         }
@@ -120,6 +120,8 @@ impl Run {
         });
         let dir = Directory::open(&path, options.resume, &options.task, options.seed, &resolved)?;
         let progress = Progress::new(options.quiet);
+        // Known to the task, not to be chosen.
+        resolved.config.refine.reverse.object_reference = Some(task.object_reference());
         Ok(Self { options: options.clone(), resolved, dir, progress, compute, task, env })
     }
 

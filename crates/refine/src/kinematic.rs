@@ -1,7 +1,7 @@
 use crate::gripper::open_states;
 use crate::motion::{motion, narrow, objects, protected};
 use crate::retime::{Node, retime};
-use crate::reverse::goals;
+use crate::reverse::{continue_path, goals};
 use crate::smooth::smooth;
 use crate::still::still_runs;
 use crate::{Fate, Refined, ReverseConfig, limits};
@@ -187,6 +187,7 @@ fn assemble(episode: &Episode, nodes: &[Node], reverse: &ReverseConfig) -> Episo
     for (state, node) in out.state.iter_mut().zip(nodes).filter(|(_, n)| n.between) {
         state[..7].copy_from_slice(&node.pose.to_row(&reverse.reference_quaternion));
     }
+    continue_path(&mut out, &reverse.reference_quaternion, reverse.object_reference);
     let poses: Vec<Pose> = nodes.iter().map(|n| n.pose).collect();
     out.action = goals(&poses, &open_states(&out, reverse), &out.excursion, reverse);
     out

@@ -1,3 +1,4 @@
+use crate::reverse::continue_path;
 use crate::{Error, Result};
 use e2h_core::{Episode, Pose};
 
@@ -40,6 +41,7 @@ pub fn resample(episode: &Episode, from_hz: f64, to_hz: f64, reference: &[f64; 4
             state[14] = width;
         }
     }
+    continue_path(&mut out, reference, None);
     Ok(out)
 }
 

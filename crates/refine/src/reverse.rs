@@ -1,6 +1,6 @@
 use crate::gripper::open_states;
 use crate::limits;
-use e2h_core::{Action, Episode, Excursion, Pose};
+use e2h_core::{Action, Episode, Excursion, Pose, continue_signs};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
@@ -29,8 +29,13 @@ pub struct ReverseConfig {
     pub open_at: f64,
     /// The gripper counts as closed below this fraction of `open_width_m`.
     pub close_at: f64,
-    /// Quaternions are written in the hemisphere of this one (wxyz); the task's reference.
+    /// The first quaternion of a path is written in the hemisphere of this one (wxyz), the task's reference; the others go on
+    /// from there without a jump.
     pub reference_quaternion: [f64; 4],
+    /// The same for the object; the task's reference, which the program says. Without one the first row of a path stays as it
+    /// is.
+    #[serde(skip)]
+    pub object_reference: Option<[f64; 4]>,
     /// What the actions of a path that exploration displaced lead to.
     pub labels: Labels,
     /// With [`Labels::Undisturbed`]: nearer than this to a switch of the gripper the excursion stays in, control steps; over as
@@ -46,6 +51,7 @@ impl Default for ReverseConfig {
             open_at: 0.95,
             close_at: 0.85,
             reference_quaternion: [0.0, 1.0, 0.0, 0.0],
+            object_reference: None,
             labels: Labels::Travelled,
             labels_fade: 8,
         }
@@ -87,8 +93,18 @@ pub fn reverse(episode: &Episode, config: &ReverseConfig) -> Episode {
     let mut reversed = episode.select(&rows);
     reversed.terminal = episode.terminal;
     reversed.origin.reversed = !episode.origin.reversed;
+    continue_path(&mut reversed, &config.reference_quaternion, config.object_reference);
     rebuild_actions(&mut reversed, config);
     reversed
+}
+
+/// Continues the signs of the quaternions of hand and object along the states, each from its reference on; the object's from
+/// its own first row where it has none.
+pub(crate) fn continue_path(episode: &mut Episode, reference: &[f64; 4], object: Option<[f64; 4]>) {
+    continue_signs(&mut episode.state, 3..7, reference);
+    if let Some(first) = episode.state.first().map(|s| [10, 11, 12, 13].map(|i| f64::from(s[i]))) {
+        continue_signs(&mut episode.state, 10..14, &object.unwrap_or(first));
+    }
 }
 
 /// Replaces the actions by the poses and openings that follow: the goal of step t is the pose at t + `lookahead` (the last
@@ -119,7 +135,9 @@ pub(crate) fn goals(
         }
     };
     // Several steps have the same goal only at the end, so rows are made once and looked up.
-    let rows: Vec<[f32; 7]> = poses.iter().map(|p| p.to_row(&config.reference_quaternion)).collect();
+    let reference = &config.reference_quaternion;
+    let mut rows: Vec<[f32; 7]> = poses.iter().map(|p| p.to_row(reference)).collect();
+    continue_signs(&mut rows, 3..7, reference);
     let goal = |t: usize| {
         let mut action = [0.0; 8];
         action[..7].copy_from_slice(&rows[(t + config.lookahead).min(last)]);
@@ -176,6 +194,28 @@ mod tests {
         e.state[1][4] = -1.0;
         rebuild_actions(&mut e, &reversal());
         assert_eq!(e.action[0][3..7], [0.0, 1.0, 0.0, 0.0]);
+    }
+
+    /// A hand that turns about the vertical from 100 to 260 degrees passes the equator of the reference on its way.
+    #[test]
+    fn signs_go_on_where_the_hand_turns_past_half_a_turn() {
+        let mut e = along(&walk(&[(16, 0.01)]));
+        let reference = [1.0, 0.0, 0.0, 0.0];
+        for (t, s) in e.state.iter_mut().enumerate() {
+            let half = (50.0 + 5.0 * t as f32).to_radians();
+            // In one hemisphere, as a driver writes them: the sign jumps in the middle.
+            let sign = half.cos().signum();
+            s[3..7].copy_from_slice(&[sign * half.cos(), 0.0, 0.0, sign * half.sin()]);
+            s[10..14].copy_from_slice(&[sign * half.cos(), 0.0, 0.0, sign * half.sin()]);
+        }
+        let hard = reverse(&e, &ReverseConfig { reference_quaternion: reference, ..reversal() });
+        let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+        for t in 0..16 {
+            assert!(dot(&hard.state[t][3..7], &hard.state[t + 1][3..7]) > 0.99, "state {t}");
+            assert!(dot(&hard.state[t][10..14], &hard.state[t + 1][10..14]) > 0.99, "object {t}");
+            assert!(dot(&hard.action[t][3..7], &hard.state[t + 1][3..7]) > 0.99, "action {t}");
+        }
+        assert!(hard.state[0][3] > 0.0, "the first row lies in the reference's hemisphere");
     }
 
     #[test]

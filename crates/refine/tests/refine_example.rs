@@ -78,6 +78,37 @@ fn refusal(dataset: &Path, out: &Path, arguments: &[&str]) -> String {
     String::from_utf8(output.stderr).unwrap()
 }
 
+/// A number that is not finite in the first of two recordings, which each have a file of their own; then half a file.
+#[test]
+fn broken_recordings_stop_the_work_or_are_left_out_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let (from, to) = (folder.path().join("unplug"), folder.path().join("plug_in"));
+    record(&from, &[true]);
+    let dataset = Dataset::open(&from).unwrap();
+    let own = ["tcp", "jaw", "joints", "front", "next.success"];
+    let mut writer = Writer::append(&from).unwrap();
+    writer.push(&dataset.read_columns(0, &own).unwrap(), "unplug").unwrap();
+    writer.finish().unwrap();
+    let file = from.join("data/chunk-000/file-000.parquet");
+    let whole = std::fs::read(&file).unwrap();
+    // Distinct numbers lie in a dictionary, each once.
+    let (place, mut bad) = (path()[100].0.to_le_bytes(), whole.clone());
+    let at = bad.windows(4).position(|w| w == place).unwrap();
+    bad[at..at + 4].copy_from_slice(&f32::NAN.to_le_bytes());
+    for (bytes, says) in [(&bad[..], "finite"), (&whole[..whole.len() / 2], "file-000.parquet")] {
+        std::fs::write(&file, bytes).unwrap();
+        let stops = refusal(&from, &to, &[]);
+        assert!(stops.contains(says), "{stops}");
+        let _ = std::fs::remove_dir_all(&to);
+        let output = refine(&from, &to, &["--skip-broken"]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success() && said.contains("left out episode 0: "), "{said}");
+        let refined = Dataset::open(&to).unwrap();
+        assert_eq!((refined.len(), refined.read(0).unwrap().i64("source.episode").unwrap()[0]), (1, 1));
+        std::fs::remove_dir_all(&to).unwrap();
+    }
+}
+
 #[test]
 fn a_recording_becomes_hard_direction_data() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,23 +1,48 @@
-//! Looks for damage in a dataset, and cuts it off.
+//! Looks for what is not as it should be in a dataset: cuts off what is damaged, and takes anew what is only out of date.
 
-use super::dataset::{Dataset, info_path, read_info};
+use super::dataset::{Dataset, LARGEST_JSON, info_path, read_info};
 use super::episodes::{self, EpisodeSpan};
-use super::feature::{Dtype, Info};
-use super::parquet_file::ParquetFile;
-use super::stats::{self, Stats};
+use super::feature::{DEFAULT_FEATURES, Dtype, Features, Info};
+use super::mp4::Times;
+use super::parquet_file::{ParquetFile, plain, replace_columns};
+use super::stats::{self, QUANTILES, Stats};
 use super::table::{Column, Table};
 use super::{picture, tasks, writer};
 use crate::atomic::{self, io};
-use crate::file::file_error;
+use crate::file::{file_error, read_regular, unsupported};
 use crate::{Error, Result};
 use serde::Serialize;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Where [`repair`] puts what it cuts off, below the dataset's folder. Neither reader looks there.
 pub const REMOVED: &str = "removed";
 /// Times may differ from their row's by this much, s: LeRobot's own tolerance.
 const TIME_TOLERANCE: f64 = 1e-4;
+/// Passes of a repair. Rows, lists of episodes and totals follow from each other in this order, after what is cut off.
+const PASSES: usize = 4;
+
+/// What a finding means for the rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FaultKind {
+    /// The rows are whole; what is noted of them beside is missing or out of date. [`repair`] takes it anew from the rows.
+    Stale,
+    /// Not read here, which says nothing of the rows. As long as there is one, [`repair`] touches nothing.
+    Unsupported,
+    /// Lost. [`repair`] cuts it off.
+    Damage,
+}
+
+impl std::fmt::Display for FaultKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Stale => "stale",
+            Self::Unsupported => "unsupported",
+            Self::Damage => "damage",
+        })
+    }
+}
 
 /// Something that is not as it should be.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -26,7 +51,9 @@ pub struct Fault {
     pub path: PathBuf,
     /// What is wrong with it, with row and column where there are such.
     pub message: String,
-    /// The first episode that is not whole because of it; none where all are.
+    /// What that means for the rows.
+    pub kind: FaultKind,
+    /// The first episode that it is found in; none where it is none's.
     pub episode: Option<usize>,
     /// Whether [`repair`] can do something about it.
     pub repairable: bool,
@@ -41,63 +68,114 @@ pub struct Report {
     pub episodes: usize,
     /// Rows that it counts.
     pub frames: usize,
-    /// Episodes before the first that is not whole: what a repair leaves.
+    /// Episodes before the first that is damaged: what a repair leaves.
     pub whole: usize,
     /// Data files whose checksums were compared.
     pub verified_files: usize,
     /// Data files without checksums, written by others: their rows were decoded, but a changed digit goes unseen there.
     pub unverified_files: usize,
-    /// All faults, in the order of the files.
+    /// All findings, damage first, in the order of the episodes.
     pub faults: Vec<Fault>,
     /// What a repair did, a line each.
     pub repairs: Vec<String>,
 }
 
 impl Report {
-    /// True without faults.
+    /// True without findings of any kind.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         self.faults.is_empty()
     }
+
+    /// The worst kind of finding; none for a sound dataset.
+    #[must_use]
+    pub fn worst(&self) -> Option<FaultKind> {
+        self.faults.iter().map(|f| f.kind).max()
+    }
+
+    /// True when there is a finding of that kind.
+    #[must_use]
+    pub fn has(&self, kind: FaultKind) -> bool {
+        self.faults.iter().any(|f| f.kind == kind)
+    }
 }
 
-/// Reads every row and every image of a dataset and compares counts, types, ranges and checksums. Finds all faults, not only
-/// the first. Changes nothing.
+/// Reads every row and every image of a dataset and the tables of its videos, and compares counts, types, ranges, times and
+/// checksums. Finds all faults, not only the first. Changes nothing.
 ///
 /// # Errors
-/// When the folder itself cannot be read; damage is part of the report.
+/// When the folder itself cannot be read; what is found in it is part of the report.
 pub fn check(root: impl AsRef<Path>) -> Result<Report> {
+    Ok(look(root.as_ref())?.0)
+}
+
+/// As [`check`]; then cuts the dataset off after its last whole episode and removes files that nothing counts, where there is
+/// damage, and takes anew from the rows what is stale: places, times, statistics. What was there before lies in [`REMOVED`].
+/// Killed at any instant it can be run again. Where anything is not supported here, it does nothing at all.
+///
+/// # Errors
+/// When nothing is left to keep, when a symbolic link leads out of the dataset, or when the file system refuses.
+pub fn repair(root: impl AsRef<Path>) -> Result<Report> {
     let root = root.as_ref();
+    let mut repairs = vec![];
+    for _ in 0..PASSES {
+        let (report, todo) = look(root)?;
+        if report.has(FaultKind::Unsupported) || !report.faults.iter().any(|f| f.repairable) {
+            return Ok(Report { repairs, ..report });
+        }
+        refuse_links(root)?;
+        if report.faults.iter().any(|f| f.kind == FaultKind::Damage && f.repairable) {
+            if report.whole == 0 {
+                return Err(file_error(
+                    &info_path(root),
+                    "episodes",
+                    "at least one whole one to keep",
+                    "none",
+                ));
+            }
+            repairs.extend(cut(root, report.whole)?);
+        } else if report.has(FaultKind::Damage) {
+            // What can be neither read nor cut off is not to be written over.
+            return Ok(Report { repairs, ..report });
+        } else {
+            repairs.extend(renew(root, &todo)?);
+        }
+    }
+    Ok(Report { repairs, ..check(root)? })
+}
+
+/// What is stale.
+#[derive(Debug, Default)]
+struct Todo {
+    /// Data files whose places or times are.
+    data: BTreeSet<(usize, usize)>,
+    /// Lists of episodes.
+    lists: bool,
+    /// `info.json` counts other rows.
+    frames: bool,
+}
+
+fn look(root: &Path) -> Result<(Report, Todo)> {
     let mut checker = Checker::new(root);
     atomic::names(&root.join("meta"))?;
     checker.run()?;
-    checker.report.faults.sort_by_key(|f| (f.episode.is_none(), f.episode));
-    Ok(checker.report)
-}
-
-/// As [`check`], then cuts the dataset off after its last whole episode where that is needed, removes files that nothing
-/// counts, and takes the statistics anew. What is removed lies in [`REMOVED`]. Killed at any instant it can be run again.
-///
-/// # Errors
-/// When nothing is left to keep, or the file system refuses.
-pub fn repair(root: impl AsRef<Path>) -> Result<Report> {
-    let root = root.as_ref();
-    let mut report = check(root)?;
-    if report.is_sound() || !report.faults.iter().any(|f| f.repairable) {
-        return Ok(report);
-    }
-    if report.whole == 0 {
-        return Err(file_error(&info_path(root), "episodes", "at least one whole one to keep", "none"));
-    }
-    let repairs = cut(root, report.whole)?;
-    report = check(root)?;
-    report.repairs = repairs;
-    Ok(report)
+    checker.report.faults.sort_by_key(|f| (std::cmp::Reverse(f.kind), f.episode.is_none(), f.episode));
+    Ok((checker.report, checker.todo))
 }
 
 struct Checker {
     root: PathBuf,
     report: Report,
+    todo: Todo,
+    /// Tables of videos that were read already.
+    videos: BTreeMap<PathBuf, Times>,
+    /// Columns that are known not to be supported: said once, not once an episode.
+    unsupported: BTreeSet<String>,
+}
+
+/// Features whose numbers lie in the data files.
+fn stored(info: &Info) -> Features {
+    info.features.iter().filter(|(_, f)| f.dtype != Dtype::Video).cloned().collect()
 }
 
 impl Checker {
@@ -112,15 +190,30 @@ impl Checker {
             faults: vec![],
             repairs: vec![],
         };
-        Self { root: root.to_owned(), report }
+        let (todo, videos, unsupported) = (Todo::default(), BTreeMap::new(), BTreeSet::new());
+        Self { root: root.to_owned(), report, todo, videos, unsupported }
     }
 
-    fn fault(&mut self, path: &Path, message: String, episode: Option<usize>, repairable: bool) {
-        self.report.faults.push(Fault { path: path.to_owned(), message, episode, repairable });
+    fn damage(&mut self, path: &Path, message: String, episode: Option<usize>, repairable: bool) {
+        let kind = FaultKind::Damage;
+        self.report.faults.push(Fault { path: path.to_owned(), message, kind, episode, repairable });
     }
 
+    fn stale(&mut self, path: &Path, message: String, episode: Option<usize>) {
+        let kind = FaultKind::Stale;
+        let fault = Fault { path: path.to_owned(), message, kind, episode, repairable: true };
+        self.report.faults.push(fault);
+    }
+
+    /// What a reader said: damage, or what is not supported here.
     fn error(&mut self, path: &Path, error: &Error, episode: Option<usize>, repairable: bool) {
-        self.fault(path, error.to_string(), episode, repairable);
+        if error.is_unsupported() {
+            let (kind, message) = (FaultKind::Unsupported, error.to_string());
+            let fault = Fault { path: path.to_owned(), message, kind, episode, repairable: false };
+            self.report.faults.push(fault);
+        } else {
+            self.damage(path, error.to_string(), episode, repairable);
+        }
     }
 
     fn run(&mut self) -> Result<()> {
@@ -133,20 +226,25 @@ impl Checker {
             }
         };
         (self.report.episodes, self.report.frames) = (info.total_episodes, info.total_frames);
+        for skipped in &info.skipped {
+            let what = format!("feature `{}`, which was not looked at", skipped.name);
+            self.error(&path, &unsupported(&path, &what, &skipped.expected, &skipped.found), None, false);
+        }
         let (spans, lists) = self.lists(&info)?;
         self.report.whole = spans.len();
+        if spans.len() < info.total_episodes && self.report.has(FaultKind::Unsupported) {
+            // Which files are whose is not known.
+            return Ok(());
+        }
         let tasks = self.tasks(&info);
         let dataset = Dataset::with_spans(&self.root, info, tasks.unwrap_or_default(), spans);
         self.checksums(&dataset);
         let statistics = self.statistics(&dataset, &lists);
-        for (episode, span) in dataset.episodes().iter().enumerate() {
-            let found = statistics.get(episode);
-            if let Err(e) = check_episode(&dataset, episode, span, found) {
-                let path = dataset.data_path(span.file).unwrap_or_default();
-                self.error(&path, &e, Some(episode), true);
-            }
+        for episode in 0..dataset.len() {
+            self.episode(&dataset, episode, statistics.get(episode));
         }
-        let broken = self.report.faults.iter().filter_map(|f| f.episode).min();
+        let damaged = self.report.faults.iter().filter(|f| f.kind == FaultKind::Damage);
+        let broken = damaged.filter_map(|f| f.episode).min();
         self.report.whole = broken.unwrap_or(dataset.len()).min(dataset.len());
         self.totals(&dataset);
         self.leftovers(&dataset, &lists)
@@ -155,24 +253,31 @@ impl Checker {
     /// The places of episodes, as far as they can be read, and the files that they are listed in.
     fn lists(&mut self, info: &Info) -> Result<(Vec<EpisodeSpan>, Vec<PathBuf>)> {
         let (mut spans, mut lists) = (vec![], vec![]);
+        let mut readable = true;
         for path in episodes::files(&episodes::folder(&self.root))? {
             if spans.len() == info.total_episodes {
                 break;
             }
             let before = spans.len();
-            let result = episodes::read_file(&path, info, &mut spans);
+            let mut stale = vec![];
+            let result = episodes::read_file(&path, info, &mut spans, &mut stale);
             lists.push(path.clone());
+            for message in stale {
+                self.todo.lists = true;
+                self.stale(&path, message, Some(before));
+            }
             if let Err(e) = result {
                 self.error(&path, &e, Some(spans.len()), true);
+                readable = false;
                 break;
             }
             if let Ok(file) = ParquetFile::open(&path) {
                 self.groups(&file, &|rows| Some(before + rows.start).filter(|&e| e < spans.len()));
             }
         }
-        if spans.len() < info.total_episodes && self.report.faults.is_empty() {
+        if spans.len() < info.total_episodes && readable {
             let message = format!("expected {} episodes, found {} listed", info.total_episodes, spans.len());
-            self.fault(&info_path(&self.root), message, Some(spans.len()), true);
+            self.damage(&info_path(&self.root), message, Some(spans.len()), true);
         }
         Ok((spans, lists))
     }
@@ -184,7 +289,7 @@ impl Checker {
                 // More are left where a commit was cut off, and do no harm.
                 if tasks.len() < info.total_tasks {
                     let message = format!("expected {} tasks, found {}", info.total_tasks, tasks.len());
-                    self.fault(&path, message, None, false);
+                    self.damage(&path, message, None, false);
                 }
                 Some(tasks)
             }
@@ -210,7 +315,7 @@ impl Checker {
                         rows.end.saturating_sub(1)
                     );
                     let first = episode(rows);
-                    self.fault(&file.path, message, first, first.is_some());
+                    self.damage(&file.path, message, first, first.is_some());
                 }
             }
             Err(e) => {
@@ -244,7 +349,7 @@ impl Checker {
                             file.path.display(),
                             file.rows()
                         );
-                        self.fault(&file.path, message, None, true);
+                        self.damage(&file.path, message, None, true);
                     }
                 }
                 Err(e) => {
@@ -262,15 +367,109 @@ impl Checker {
         for path in lists {
             let left = dataset.len().saturating_sub(found.len());
             let rows = ParquetFile::open(path).map_or(0, |f| f.rows()).min(left);
-            match episodes::read_stats(path, &dataset.info().features, rows) {
+            match episodes::read_stats(path, &stored(dataset.info()), rows) {
                 Ok(stats) => found.extend(stats),
                 Err(e) => {
-                    self.error(path, &e, None, false);
+                    self.todo.lists = true;
+                    self.stale(path, e.to_string(), Some(found.len()));
                     break;
                 }
             }
         }
         found
+    }
+
+    /// Reads one episode whole: types, ranges, times, images and videos, and that its statistics are its own.
+    fn episode(&mut self, dataset: &Dataset, episode: usize, stats: Option<&Stats>) {
+        let span = &dataset.episodes()[episode];
+        let path = dataset.data_path(span.file).unwrap_or_default();
+        let stored = stored(dataset.info());
+        let names: Vec<&str> = stored.iter().map(|(n, _)| n.as_str()).collect();
+        let table = dataset.read_columns(episode, &names).or_else(|e| {
+            // The file as a whole: said once.
+            if e.is_unsupported() && dataset.read_columns(episode, &["timestamp"]).is_err() {
+                return Err(e);
+            }
+            // Each by itself: what is damaged in one column is to be found beside what is not supported in another.
+            let mut table = Table { rows: span.length, columns: vec![] };
+            let mut blamed = false;
+            for name in &names {
+                match dataset.read_columns(episode, &[name]) {
+                    Ok(found) => table.columns.extend(found.columns),
+                    Err(e) => {
+                        blamed = true;
+                        if !e.is_unsupported() {
+                            return Err(e);
+                        }
+                        if self.unsupported.insert((*name).to_owned()) {
+                            self.error(&path, &e, Some(episode), false);
+                        }
+                    }
+                }
+            }
+            if blamed { Ok(table) } else { Err(e) }
+        });
+        let table = match table {
+            Ok(table) => table,
+            Err(e) if e.is_unsupported() && !self.unsupported.insert(e.to_string()) => return,
+            Err(e) => return self.error(&path, &e, Some(episode), true),
+        };
+        // Said already.
+        if DEFAULT_FEATURES.iter().any(|(name, _)| table.column(name).is_none()) {
+            return;
+        }
+        if let Err(e) = check_rows(dataset, episode, span, &table) {
+            if !e.is_unsupported() || self.unsupported.insert(e.to_string()) {
+                self.error(&path, &e, Some(episode), true);
+            }
+            return;
+        }
+        if let Some(message) = stale_rows(dataset, episode, span, &table, &path) {
+            self.todo.data.insert(span.file);
+            self.stale(&path, message, Some(episode));
+        }
+        let list = episodes::path(dataset.root(), span.listed_in);
+        if let Some(stats) = stats
+            && let Err(e) = check_stats(&table, dataset.info(), stats, &list, episode)
+        {
+            self.todo.lists = true;
+            self.stale(&list, e.to_string(), Some(episode));
+        }
+        self.videos(dataset, episode, span);
+    }
+
+    /// Every frame is there, at its time.
+    fn videos(&mut self, dataset: &Dataset, episode: usize, span: &EpisodeSpan) {
+        let fps = dataset.info().fps;
+        for (name, video) in &span.videos {
+            let path = match dataset.video_path(name, video.file) {
+                Ok(path) => path,
+                Err(e) => {
+                    self.error(&info_path(&self.root), &e, Some(episode), false);
+                    continue;
+                }
+            };
+            if !self.videos.contains_key(&path) {
+                match Times::read(&path) {
+                    Ok(times) => drop(self.videos.insert(path.clone(), times)),
+                    Err(e) => {
+                        self.error(&path, &e, Some(episode), true);
+                        continue;
+                    }
+                }
+            }
+            let Some(times) = self.videos.get(&path) else { continue };
+            if let Err(e) = times.check(&path, video.from, span.length, fps) {
+                self.error(&path, &e, Some(episode), true);
+            } else if (video.to - video.from - span.length as f64 / fps).abs() > 1.5 / fps {
+                let list = episodes::path(dataset.root(), span.listed_in);
+                let what = format!("column `videos/{name}/to_timestamp`, episode {episode}");
+                let expected = video.from + span.length as f64 / fps;
+                let e = file_error(&list, &what, expected.to_string(), video.to.to_string());
+                self.todo.lists = true;
+                self.stale(&list, e.to_string(), Some(episode));
+            }
+        }
     }
 
     /// Counts and statistics over all episodes.
@@ -279,13 +478,14 @@ impl Checker {
         let frames = dataset.episodes().last().map_or(0, |e| e.from + e.length);
         if dataset.len() == dataset.info().total_episodes && frames != dataset.info().total_frames {
             let message = format!("total_frames: expected {frames}, found {}", dataset.info().total_frames);
-            self.fault(&path, message, None, true);
+            self.todo.frames = true;
+            self.stale(&path, message, None);
         }
         let path = self.root.join("meta/stats.json");
-        if let Ok(total) = writer::total_stats(&self.root, dataset.info(), dataset.episodes())
+        if let Ok(total) = writer::total_stats(&self.root, &stored(dataset.info()), dataset.len())
             && let Err(e) = check_totals(&path, &total, dataset.info())
         {
-            self.error(&path, &e, None, true);
+            self.stale(&path, e.to_string(), None);
         }
     }
 
@@ -293,14 +493,32 @@ impl Checker {
     fn leftovers(&mut self, dataset: &Dataset, lists: &[PathBuf]) -> Result<()> {
         for path in uncounted(&self.root, dataset, lists)? {
             let message = format!("{}: expected no file, found one that nothing counts", path.display());
-            self.fault(&path, message, None, true);
+            self.damage(&path, message, None, true);
         }
         for path in writer::unfinished(&self.root)? {
             let message = format!("{}: left behind by a writer that was killed", path.display());
-            self.fault(&path, message, None, true);
+            self.damage(&path, message, None, true);
         }
         Ok(())
     }
+}
+
+/// Nothing is changed through a symbolic link: what it leads to may be another's.
+fn refuse_links(root: &Path) -> Result<()> {
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for path in atomic::names(&folder)? {
+            let found = std::fs::symlink_metadata(&path).map_err(io("look at", &path))?;
+            if found.is_symlink() && !path.starts_with(root.join("videos")) {
+                return Err(unsupported(&path, "repair", "a file of the dataset's own", "a symbolic link"));
+            }
+            // Videos are never changed.
+            if found.is_dir() && path != root.join("videos") {
+                folders.push(path);
+            }
+        }
+    }
+    Ok(())
 }
 
 /// Parquet files that hold none of the dataset's episodes.
@@ -319,21 +537,12 @@ fn uncounted(root: &Path, dataset: &Dataset, lists: &[PathBuf]) -> Result<Vec<Pa
     Ok(found)
 }
 
-/// Reads one episode whole: types, ranges, times, images, and that its statistics are its own.
-fn check_episode(dataset: &Dataset, episode: usize, span: &EpisodeSpan, stats: Option<&Stats>) -> Result<()> {
+/// Types, ranges, times and images of one episode.
+fn check_rows(dataset: &Dataset, episode: usize, span: &EpisodeSpan, table: &Table) -> Result<()> {
     let info = dataset.info();
-    let stored: Vec<&str> =
-        info.features.iter().filter(|(_, f)| f.dtype != Dtype::Video).map(|(n, _)| n.as_str()).collect();
-    let table = dataset.read_columns(episode, &stored)?;
     let path = dataset.data_path(span.file)?;
     let first = dataset.rows_in_file(episode, span).start;
     let place = |name: &str, row: usize| format!("column `{name}`, row {}", first + row);
-    for (row, &time) in table.f32("timestamp")?.iter().enumerate() {
-        let expected = row as f64 / info.fps;
-        if (f64::from(time) - expected).abs() > TIME_TOLERANCE + expected * f64::from(f32::EPSILON) {
-            return Err(file_error(&path, &place("timestamp", row), expected.to_string(), time.to_string()));
-        }
-    }
     for (row, &task) in table.i64("task_index")?.iter().enumerate() {
         if !dataset.tasks().is_empty() && usize::try_from(task).map_or(true, |t| t >= dataset.tasks().len()) {
             let expected = format!("below {}", dataset.tasks().len());
@@ -343,38 +552,56 @@ fn check_episode(dataset: &Dataset, episode: usize, span: &EpisodeSpan, stats: O
     for (name, feature) in &info.features {
         let Some(column) = table.column(name) else { continue };
         let width = if feature.is_visual() { 1 } else { feature.width() };
-        if let (Column::Png(files), [height, width, _]) = (column, &feature.shape[..]) {
+        if let (Column::Png(files), Some((height, width))) = (column, feature.image_size()) {
             for (row, file) in files.iter().enumerate() {
-                picture::decode(file, *height, *width, &path, &place(name, row))?;
+                picture::decode(file, height, width, &path, &place(name, row))?;
             }
         }
         if let Some(numbers) = column.numbers()
             && let Some(i) = numbers.iter().position(|v| !v.is_finite())
         {
-            return Err(file_error(
-                &path,
-                &place(name, i / width),
-                "a finite number",
-                numbers[i].to_string(),
-            ));
+            let what = place(name, i / width);
+            return Err(file_error(&path, &what, "a finite number", numbers[i].to_string()));
         }
     }
-    if let Some(stats) = stats {
-        check_stats(&table, info, stats, &episodes::path(dataset.root(), span.listed_in), episode)?;
-    }
-    for (name, video) in &span.videos {
-        let file = info.video_file(name, video.file.0, video.file.1).unwrap_or_default();
-        let file = dataset.root().join(file);
-        let expected = span.length as f64 / info.fps;
-        if !file.is_file() {
-            return Err(file_error(&file, "video", "a file", "none"));
-        }
-        if (video.to - video.from - expected).abs() > 1.5 / info.fps {
-            let found = format!("{} s to {} s", video.from, video.to);
-            return Err(file_error(&file, &format!("episode {episode}"), format!("{expected} s"), found));
+    for (row, &time) in table.f32("timestamp")?.iter().enumerate() {
+        let expected = row as f64 / info.fps;
+        if (f64::from(time) - expected).abs() >= 0.5 / info.fps {
+            return Err(file_error(&path, &place("timestamp", row), expected.to_string(), time.to_string()));
         }
     }
     Ok(())
+}
+
+/// The first place or time that the rows' order says better.
+fn stale_rows(
+    dataset: &Dataset,
+    episode: usize,
+    span: &EpisodeSpan,
+    table: &Table,
+    path: &Path,
+) -> Option<String> {
+    let fps = dataset.info().fps;
+    let first = dataset.rows_in_file(episode, span).start;
+    let says = |name: &str, row: usize, expected: String, found: String| {
+        let what = format!("column `{name}`, row {}", first + row);
+        Some(file_error(path, &what, expected, found).to_string())
+    };
+    for (row, &time) in table.f32("timestamp").ok()?.iter().enumerate() {
+        let expected = row as f64 / fps;
+        if (f64::from(time) - expected).abs() > TIME_TOLERANCE + expected * f64::from(f32::EPSILON) {
+            return says("timestamp", row, expected.to_string(), time.to_string());
+        }
+    }
+    for (name, begin, step) in [("index", span.from, 1), ("episode_index", episode, 0)] {
+        for (row, &found) in table.i64(name).ok()?.iter().enumerate() {
+            let expected = begin + step * row;
+            if usize::try_from(found).ok() != Some(expected) {
+                return says(name, row, expected.to_string(), found.to_string());
+            }
+        }
+    }
+    None
 }
 
 /// The least and the largest number of every column, and the count, are those that were noted when it was written.
@@ -406,7 +633,7 @@ fn check_stats(table: &Table, info: &Info, noted: &Stats, path: &Path, episode: 
 
 /// `stats.json` is the sum over the episodes.
 fn check_totals(path: &Path, total: &Stats, info: &Info) -> Result<()> {
-    let text = std::fs::read(path).map_err(io("read", path))?;
+    let text = read_regular(path, LARGEST_JSON)?;
     let found: serde_json::Value =
         serde_json::from_slice(&text).map_err(|e| file_error(path, "JSON", "statistics", e.to_string()))?;
     let expected = stats::to_json(total, &info.features);
@@ -414,6 +641,14 @@ fn check_totals(path: &Path, total: &Stats, info: &Info) -> Result<()> {
         for key in ["count", "min", "max", "mean"] {
             let (want, got) = (&expected[name][key], &found[name][key]);
             if !close(want, got) {
+                let what = format!("`{name}`, {key}");
+                return Err(file_error(path, &what, want.to_string(), got.to_string()));
+            }
+        }
+        // Of others that took them by another rule, but there.
+        for key in QUANTILES.iter().map(|q| q.0).chain(["std"]) {
+            let (want, got) = (&expected[name][key], &found[name][key]);
+            if want.as_array().map(Vec::len) != got.as_array().map(Vec::len) {
                 let what = format!("`{name}`, {key}");
                 return Err(file_error(path, &what, want.to_string(), got.to_string()));
             }
@@ -447,7 +682,7 @@ fn cut(root: &Path, whole: usize) -> Result<Vec<String>> {
             break;
         }
         let before = spans.len();
-        episodes::read_file(&path, &listed, &mut spans)?;
+        episodes::read_file(&path, &listed, &mut spans, &mut vec![])?;
         lists.push((path, spans.len() - before));
     }
     let frames = spans.last().map_or(0, |e| e.from + e.length);
@@ -458,13 +693,7 @@ fn cut(root: &Path, whole: usize) -> Result<Vec<String>> {
         info.splits.insert("train".to_owned(), format!("0:{whole}").into());
         writer::write_json(&info_path(root), &info)?;
     }
-    match writer::total_stats(root, &info, &spans) {
-        Ok(total) => {
-            writer::write_json(&root.join("meta/stats.json"), &stats::to_json(&total, &info.features))?;
-            done.push("took the statistics anew".to_owned());
-        }
-        Err(e) => done.push(format!("left meta/stats.json as it is: {e}")),
-    }
+    renew_totals(root, &info, spans.len(), &mut done)?;
 
     let dataset = Dataset::with_spans(root, info, vec![], spans);
     if let Some(last) = dataset.episodes().last() {
@@ -496,6 +725,120 @@ fn cut(root: &Path, whole: usize) -> Result<Vec<String>> {
     Ok(done)
 }
 
+/// Takes anew what is stale: rows first, then the lists of episodes, then the totals. What follows from what was written is
+/// stale only then, and is left to the next pass.
+fn renew(root: &Path, todo: &Todo) -> Result<Vec<String>> {
+    let mut done = vec![];
+    let mut info = read_info(root)?;
+    let (mut spans, mut lists) = (vec![], vec![]);
+    for path in episodes::files(&episodes::folder(root))? {
+        if spans.len() == info.total_episodes {
+            break;
+        }
+        let before = spans.len();
+        episodes::read_file(&path, &info, &mut spans, &mut vec![])?;
+        lists.push((path, before..spans.len()));
+    }
+    if todo.frames {
+        info.total_frames = spans.last().map_or(0, |e| e.from + e.length);
+        writer::write_json(&info_path(root), &info)?;
+        done.push(format!("counted {} rows in meta/info.json", info.total_frames));
+    }
+    let dataset = Dataset::with_spans(root, info, vec![], spans);
+    for &file in &todo.data {
+        renew_rows(&dataset, file, &mut done)?;
+    }
+    if todo.data.is_empty() && todo.lists {
+        for (path, listed) in &lists {
+            renew_list(&dataset, path, listed.clone(), &mut done)?;
+        }
+    }
+    if todo.data.is_empty() {
+        renew_totals(root, dataset.info(), dataset.len(), &mut done)?;
+    }
+    Ok(done)
+}
+
+/// Places and times of the rows of one data file, by their order.
+fn renew_rows(dataset: &Dataset, file: (usize, usize), done: &mut Vec<String>) -> Result<()> {
+    let path = dataset.data_path(file)?;
+    let fps = dataset.info().fps;
+    let (mut ends, mut end) = (vec![], 0);
+    let (mut times, mut index, mut number) = (vec![], vec![], vec![]);
+    for (episode, span) in dataset.episodes().iter().enumerate().filter(|(_, e)| e.file == file) {
+        end += span.length;
+        ends.push(end);
+        #[allow(clippy::cast_possible_truncation, reason = "LeRobot keeps times as f32")]
+        times.extend((0..span.length).map(|row| (row as f64 / fps) as f32));
+        index.extend((0..span.length).map(|row| i64::try_from(span.from + row).unwrap_or(i64::MAX)));
+        number.extend(std::iter::repeat_n(i64::try_from(episode).unwrap_or(i64::MAX), span.length));
+    }
+    set_aside(dataset.root(), &path)?;
+    ParquetFile::open(&path)?.rewrite(&ends, &|_| true, &mut |batch, first| {
+        let rows = first..first + batch.num_rows();
+        let wrong = || file_error(&path, "file", format!("{end} rows"), "others");
+        let columns = vec![
+            ("timestamp".to_owned(), Column::F32(times.get(rows.clone()).ok_or_else(wrong)?.to_vec())),
+            ("index".to_owned(), Column::I64(index.get(rows.clone()).ok_or_else(wrong)?.to_vec())),
+            ("episode_index".to_owned(), Column::I64(number.get(rows).ok_or_else(wrong)?.to_vec())),
+        ];
+        replace_columns(batch, columns.into_iter().map(|(name, c)| (name, plain(&c))).collect(), &path)
+    })?;
+    done.push(format!("took places and times anew in {}", path.display()));
+    Ok(())
+}
+
+/// Places and statistics of the episodes of one list, from their rows. Statistics of videos stay as they are.
+fn renew_list(
+    dataset: &Dataset,
+    path: &Path,
+    listed: std::ops::Range<usize>,
+    done: &mut Vec<String>,
+) -> Result<()> {
+    let info = dataset.info();
+    let stored = stored(info);
+    let names: Vec<&str> = stored.iter().map(|(n, _)| n.as_str()).collect();
+    let mut entries = vec![];
+    for episode in listed.clone() {
+        let stats = stats::of_table(&dataset.read_columns(episode, &names)?, &stored)?;
+        entries.push(episodes::Entry { index: episode, span: dataset.episodes()[episode].clone(), stats });
+    }
+    let anew = |column: &str| {
+        let of_rows = column.strip_prefix("stats/").and_then(|c| c.rsplit_once('/'));
+        !of_rows.is_some_and(|(name, _)| names.contains(&name))
+    };
+    set_aside(dataset.root(), path)?;
+    ParquetFile::open(path)?.rewrite(&[listed.len()], &anew, &mut |batch, first| {
+        let entries = &entries[first..first + batch.num_rows()];
+        replace_columns(batch, episodes::renewed(entries, info, path)?, path)
+    })?;
+    done.push(format!("took places and statistics anew in {}", path.display()));
+    Ok(())
+}
+
+/// `stats.json` from the lists of episodes. What it says of videos is kept where the lists say nothing of them.
+fn renew_totals(root: &Path, info: &Info, episodes: usize, done: &mut Vec<String>) -> Result<()> {
+    let path = root.join("meta/stats.json");
+    let mut total = match writer::total_stats(root, &stored(info), episodes) {
+        Ok(total) => total,
+        Err(e) => {
+            done.push(format!("left meta/stats.json as it is: {e}"));
+            return Ok(());
+        }
+    };
+    for feature in info.features.iter().filter(|(_, f)| f.dtype == Dtype::Video) {
+        total.extend(writer::total_stats(root, &vec![feature.clone()], episodes).unwrap_or_default());
+    }
+    let before = read_regular(&path, LARGEST_JSON).ok().and_then(|t| serde_json::from_slice(&t).ok());
+    let mut whole: serde_json::Map<String, serde_json::Value> = before.unwrap_or_default();
+    if let serde_json::Value::Object(new) = stats::to_json(&total, &info.features) {
+        whole.extend(new);
+    }
+    writer::write_json(&path, &whole)?;
+    done.push("took the statistics anew".to_owned());
+    Ok(())
+}
+
 /// Leaves the first `rows` rows of a file.
 fn shorten(root: &Path, path: &Path, rows: usize, ends: &[usize], done: &mut Vec<String>) -> Result<()> {
     let file = ParquetFile::open(path)?;
@@ -503,7 +846,7 @@ fn shorten(root: &Path, path: &Path, rows: usize, ends: &[usize], done: &mut Vec
         return Ok(());
     }
     set_aside(root, path)?;
-    file.truncate(ends)?;
+    file.rewrite(ends, &|_| true, &mut |batch, _| Ok(batch.clone()))?;
     done.push(format!("cut {} off after row {rows}", path.display()));
     Ok(())
 }

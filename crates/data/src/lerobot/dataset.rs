@@ -2,9 +2,8 @@ use super::episodes::{self, EpisodeSpan};
 use super::feature::{DEFAULT_FEATURES, Dtype, Feature, INSIDE, Info};
 use super::parquet_file::ParquetFile;
 use super::table::{Column, Table};
-use super::{tasks, video};
-use crate::atomic::io;
-use crate::file::file_error;
+use super::{mp4, tasks, video};
+use crate::file::{file_error, read_regular, unsupported};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -37,13 +36,16 @@ impl std::fmt::Debug for ParquetFile {
     }
 }
 
+/// Size of `info.json` and `stats.json`, bytes: a hundred times what a large robot's take.
+pub(crate) const LARGEST_JSON: u64 = 1 << 26;
+
 pub(crate) fn info_path(root: &Path) -> PathBuf {
     root.join("meta/info.json")
 }
 
 pub(crate) fn read_info(root: &Path) -> Result<Info> {
     let path = info_path(root);
-    Info::parse(&std::fs::read(&path).map_err(io("read", &path))?, &path)
+    Info::parse(&read_regular(&path, LARGEST_JSON)?, &path)
 }
 
 impl Dataset {
@@ -62,7 +64,7 @@ impl Dataset {
             if episodes.len() == info.total_episodes {
                 break;
             }
-            episodes::read_file(&path, &info, &mut episodes)?;
+            episodes::read_file(&path, &info, &mut episodes, &mut vec![])?;
         }
         let counted = |what, expected: usize, found: usize| {
             let path = info_path(&root);
@@ -124,7 +126,7 @@ impl Dataset {
         self.episodes.is_empty()
     }
 
-    /// All columns of an episode, videos included.
+    /// All columns of an episode, videos included; those of [`Info::skipped`] are not among them.
     ///
     /// # Errors
     /// As [`Dataset::read_columns`].
@@ -142,6 +144,10 @@ impl Dataset {
         let span = self.span(episode)?;
         let mut features: Vec<(&str, &Feature)> = vec![];
         for name in names {
+            if let Some(skipped) = self.info.skipped.iter().find(|s| s.name == *name) {
+                let what = format!("feature `{name}`");
+                return Err(unsupported(&info_path(&self.root), &what, &skipped.expected, &skipped.found));
+            }
             let found = self.info.features.iter().find(|(n, _)| n == name).ok_or_else(|| Error::Column {
                 column: (*name).to_owned(),
                 expected: "a column of the dataset".to_owned(),
@@ -152,6 +158,9 @@ impl Dataset {
         let file = self.file(span)?;
         let rows = self.rows_in_file(episode, span);
         self.check_place(&file, episode, span, rows.clone())?;
+        if features.iter().any(|(_, f)| f.dtype == Dtype::Video) {
+            self.check_times(&file, rows.clone())?;
+        }
         let stored: Vec<(&str, &Feature)> =
             features.iter().filter(|(_, f)| f.dtype != Dtype::Video).copied().collect();
         let mut stored = file.read(&stored, rows)?.into_iter();
@@ -216,7 +225,25 @@ impl Dataset {
         start..start + span.length
     }
 
-    /// The rows are the episode's: their indices say so.
+    /// Rows and frames of a video belong together by their number, which they do only where the rows keep to the grid.
+    fn check_times(&self, file: &ParquetFile, rows: std::ops::Range<usize>) -> Result<()> {
+        let time = Feature::scalar(Dtype::Float32);
+        let columns = file.read(&[("timestamp", &time)], rows.clone())?;
+        let [(_, Column::F32(times))] = &columns[..] else { return Ok(()) };
+        for (row, &found) in times.iter().enumerate() {
+            let expected = row as f64 / self.info.fps;
+            let off = (f64::from(found) - expected).abs();
+            if off.is_nan() || off >= 0.5 / self.info.fps {
+                let what = format!("column `timestamp`, row {}", rows.start + row);
+                let expected = format!("within half a frame of {expected} s");
+                return Err(file_error(&file.path, &what, expected, found.to_string()));
+            }
+        }
+        Ok(())
+    }
+
+    /// The rows are the episode's: their numbers within the episode say so, and that of the episode, which may count from the
+    /// beginning of the file. What `index` says is not asked: merging and splitting leave it as it was.
     pub(crate) fn check_place(
         &self,
         file: &ParquetFile,
@@ -225,16 +252,18 @@ impl Dataset {
         rows: std::ops::Range<usize>,
     ) -> Result<()> {
         let features: Vec<(&str, Feature)> =
-            DEFAULT_FEATURES[1..4].iter().map(|(n, dtype)| (*n, Feature::scalar(*dtype))).collect();
+            DEFAULT_FEATURES[1..3].iter().map(|(n, dtype)| (*n, Feature::scalar(*dtype))).collect();
         let features: Vec<(&str, &Feature)> = features.iter().map(|(n, f)| (*n, f)).collect();
         let columns = file.read(&features, rows.clone())?;
+        let in_file = self.episodes[..episode].iter().rev().take_while(|e| e.file == span.file).count();
         for (name, column) in &columns {
             let Column::I64(values) = column else { continue };
+            let restarts = values.iter().all(|&v| usize::try_from(v).ok() == Some(in_file));
             for (row, &found) in values.iter().enumerate() {
                 let expected = match name.as_str() {
                     "frame_index" => row,
-                    "episode_index" => episode,
-                    _ => span.from + row,
+                    _ if restarts => in_file,
+                    _ => episode,
                 };
                 if usize::try_from(found).ok() != Some(expected) {
                     let what = format!("column `{name}`, row {}", rows.start + row);
@@ -249,9 +278,15 @@ impl Dataset {
         let place = span.videos.get(name).ok_or_else(|| {
             file_error(&episodes::path(&self.root, span.listed_in), name, "a place in a video", "none")
         })?;
-        let path = self.info.video_file(name, place.file.0, place.file.1);
-        let path = path.map_err(|found| file_error(&info_path(&self.root), "video_path", INSIDE, found))?;
+        let path = self.video_path(name, place.file)?;
         let fps = self.info.fps;
-        video::read(&self.root.join(path), place.from, span.length, fps, feature)
+        mp4::Times::read(&path)?.check(&path, place.from, span.length, fps)?;
+        video::read(&path, place.from, span.length, fps, feature)
+    }
+
+    pub(crate) fn video_path(&self, name: &str, file: (usize, usize)) -> Result<PathBuf> {
+        let path = self.info.video_file(name, file.0, file.1);
+        path.map(|p| self.root.join(p))
+            .map_err(|found| file_error(&info_path(&self.root), "video_path", INSIDE, found))
     }
 }

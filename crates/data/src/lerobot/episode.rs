@@ -230,15 +230,15 @@ pub fn from_table(table: &Table, features: &Features, task: &str) -> Result<(Epi
     });
     let mut frames = vec![];
     for (name, feature) in features {
-        let (Some(camera), [height, width, _]) = (name.strip_prefix(IMAGES), &feature.shape[..]) else {
+        let (Some(camera), Some((height, width))) = (name.strip_prefix(IMAGES), feature.image_size()) else {
             continue;
         };
         let mut data = Vec::with_capacity(table.rows * height * width * 3);
         for (row, file) in table.png(name)?.iter().enumerate() {
             let what = format!("column `{name}`, row {row}");
-            data.extend(picture::decode(file, *height, *width, Path::new("(episode)"), &what)?);
+            data.extend(picture::decode(file, height, width, Path::new("(episode)"), &what)?);
         }
-        frames.push(Frames { camera: camera.to_owned(), height: *height, width: *width, data });
+        frames.push(Frames { camera: camera.to_owned(), height, width, data });
     }
     let episode = Episode {
         state: rows(table, "observation.state")?,

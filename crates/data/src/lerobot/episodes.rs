@@ -63,7 +63,14 @@ pub(crate) fn files(folder: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// The entries of one file, as many as `info` counts: what a killed writer left behind them is not part of the dataset.
-pub(crate) fn read_file(path: &Path, info: &Info, out: &mut Vec<EpisodeSpan>) -> Result<()> {
+/// What the rows say better, as where an episode begins among all rows, is counted anew; where the file says otherwise, a line
+/// is added to `stale`.
+pub(crate) fn read_file(
+    path: &Path,
+    info: &Info,
+    out: &mut Vec<EpisodeSpan>,
+    stale: &mut Vec<String>,
+) -> Result<()> {
     let file = ParquetFile::open(path)?;
     let rows = file.rows().min(info.total_episodes.saturating_sub(out.len()));
     if rows == 0 {
@@ -115,18 +122,27 @@ pub(crate) fn read_file(path: &Path, info: &Info, out: &mut Vec<EpisodeSpan>) ->
         let expected_from = out.last().map_or(0, |e| e.from + e.length);
         for (name, expected, found) in [
             ("episode_index", out.len(), index[row]),
-            ("dataset_from_index", expected_from, from[row]),
-            ("dataset_to_index", expected_from.saturating_add(length[row]), to[row]),
             ("length", length[row].max(1), length[row]),
+            // What no data file can have; a sum of such lengths might not fit.
+            ("length", length[row].min(1 << 40), length[row]),
         ] {
             if expected != found {
                 let what = format!("column `{name}`, row {row}");
                 return Err(file_error(path, &what, expected.to_string(), found.to_string()));
             }
         }
+        for (name, expected, found) in [
+            ("dataset_from_index", expected_from, from[row]),
+            ("dataset_to_index", expected_from + length[row], to[row]),
+        ] {
+            if expected != found {
+                let what = format!("column `{name}`, row {row}");
+                stale.push(file_error(path, &what, expected.to_string(), found.to_string()).to_string());
+            }
+        }
         out.push(EpisodeSpan {
             length: length[row],
-            from: from[row],
+            from: expected_from,
             tasks,
             file: (chunk[row], data_file[row]),
             listed_in: (listed_chunk[row], listed_file[row]),
@@ -195,6 +211,38 @@ pub(crate) fn to_batch(entries: &[Entry], features: &Features, path: &Path) -> R
     columns.push(("meta/episodes/chunk_index".into(), integers(&|e| e.span.listed_in.0)));
     columns.push(("meta/episodes/file_index".into(), integers(&|e| e.span.listed_in.1)));
     batch(columns, path)
+}
+
+/// The columns of some entries that follow from the rows: places, ends of videos, statistics.
+pub(crate) fn renewed(entries: &[Entry], info: &Info, path: &Path) -> Result<Vec<(String, ArrayRef)>> {
+    let counts = |f: &dyn Fn(&Entry) -> usize| -> ArrayRef {
+        Arc::new(Int64Array::from_iter_values(
+            entries.iter().map(|e| i64::try_from(f(e)).unwrap_or(i64::MAX)),
+        ))
+    };
+    let mut columns = vec![
+        ("dataset_from_index".to_owned(), counts(&|e| e.span.from)),
+        ("dataset_to_index".to_owned(), counts(&|e| e.span.from + e.span.length)),
+    ];
+    for (name, feature) in &info.features {
+        if feature.dtype == Dtype::Video {
+            let end =
+                |e: &Entry| e.span.videos.get(name).map_or(0.0, |v| v.from + e.span.length as f64 / info.fps);
+            let ends: ArrayRef = Arc::new(Float64Array::from_iter_values(entries.iter().map(end)));
+            columns.push((format!("videos/{name}/to_timestamp"), ends));
+        } else if feature.dtype != Dtype::String {
+            let stats: Vec<&FeatureStats> = entries
+                .iter()
+                .filter_map(|e| e.stats.iter().find(|(n, _)| n == name).map(|(_, s)| s))
+                .collect();
+            if stats.len() != entries.len() {
+                let what = format!("statistics of `{name}`");
+                return Err(file_error(path, &what, entries.len().to_string(), stats.len().to_string()));
+            }
+            columns.extend(stat_columns(name, bounds(feature), &stats));
+        }
+    }
+    Ok(columns)
 }
 
 fn stat_columns(name: &str, kind: Bounds, stats: &[&FeatureStats]) -> Vec<(String, ArrayRef)> {

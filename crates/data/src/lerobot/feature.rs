@@ -1,8 +1,9 @@
 //! What a dataset says of itself: `meta/info.json`.
 
-use crate::file::file_error;
+use crate::file::{file_error, unsupported};
 use crate::{Error, Result};
 use serde::de::{Error as _, MapAccess, Visitor};
+use serde::ser::SerializeMap;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Map, Value};
 use std::path::{Component, Path, PathBuf};
@@ -51,9 +52,11 @@ pub enum Dtype {
 pub struct Feature {
     /// Type of the numbers.
     pub dtype: Dtype,
-    /// Shape of one row: `[1]` is a plain number, `[height, width, 3]` an image.
+    /// Shape of one row: `[1]` is a plain number, `[height, width, 3]` an image. Some recorders write `[3, height, width]` of
+    /// images that lie in their files as all others do, see [`Feature::image_size`].
     pub shape: Vec<usize>,
     /// Names of the entries: a list, null, or what else a recorder put there.
+    #[serde(default)]
     pub names: Value,
     /// What else `info.json` says of it; kept as it is.
     #[serde(flatten)]
@@ -87,6 +90,41 @@ impl Feature {
         self.shape.iter().product()
     }
 
+    /// Rows and columns of an image; none for what is no image of three channels. Where the shape could be read either way,
+    /// the names of its entries decide.
+    #[must_use]
+    pub fn image_size(&self) -> Option<(usize, usize)> {
+        let first = self.names.as_array().and_then(|n| n.first()).and_then(Value::as_str);
+        let channels_first = first.is_some_and(|n| n.starts_with("channel") || n == "c");
+        match self.shape[..] {
+            _ if !self.is_visual() => None,
+            [3, height, width] if channels_first || width != 3 => Some((height, width)),
+            [height, width, 3] => Some((height, width)),
+            _ => None,
+        }
+    }
+
+    /// What keeps a feature from being read here: what is expected, and what was found.
+    fn problem(&self, videos: bool) -> Option<(&'static str, String)> {
+        let shape = || format!("{:?}", self.shape);
+        let size = self.shape.iter().try_fold(1_usize, |a, &b| a.checked_mul(b));
+        let deep = self.shape.len() > 5;
+        if self.shape.is_empty() || deep || size.is_none_or(|n| n == 0 || n > LARGEST) {
+            return Some(("a shape of 1 to 5 sizes, none 0", shape()));
+        }
+        let image = self.image_size().is_some_and(|(h, w)| h < 1 << 16 && w < 1 << 16);
+        if self.is_visual() && !image {
+            return Some(("an image of shape [height, width, 3] or [3, height, width]", shape()));
+        }
+        if self.dtype == Dtype::String && self.shape != [1] {
+            return Some(("shape [1] for text", shape()));
+        }
+        if self.dtype == Dtype::Video && !videos {
+            return Some(("a video_path, since there are videos", "null".to_owned()));
+        }
+        None
+    }
+
     /// True for images, in Parquet or in videos.
     #[must_use]
     pub fn is_visual(&self) -> bool {
@@ -102,6 +140,22 @@ impl Feature {
     pub(crate) fn describe(&self) -> String {
         format!("{:?} {:?}", self.dtype, self.shape).to_lowercase()
     }
+}
+
+/// A feature that `info.json` names and that cannot be read here: an unknown type, or a shape that is none. It closes nothing
+/// but itself; who asks for it gets an error.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Skipped {
+    /// Name of the feature.
+    pub name: String,
+    /// What is read here.
+    pub expected: String,
+    /// What the file says.
+    pub found: String,
+    /// Its place among all features.
+    place: usize,
+    /// What the file says of it; kept as it is.
+    value: Value,
 }
 
 /// Features in the order of `info.json`, which is the order of columns.
@@ -121,7 +175,7 @@ pub(crate) fn is_default(name: &str) -> bool {
 }
 
 /// The contents of `meta/info.json`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct Info {
     /// Version of the layout.
     pub codebase_version: String,
@@ -144,7 +198,6 @@ pub struct Info {
     #[serde(default = "video_file_size")]
     pub video_files_size_in_mb: usize,
     /// Rows a second, Hz.
-    #[serde(serialize_with = "write_fps")]
     pub fps: f64,
     /// Named ranges of episodes.
     #[serde(default)]
@@ -154,9 +207,12 @@ pub struct Info {
     /// Where videos are, below the root; none without videos.
     #[serde(default)]
     pub video_path: Option<String>,
-    /// All features, those of [`DEFAULT_FEATURES`] included.
-    #[serde(with = "in_order")]
+    /// All features that can be read, those of [`DEFAULT_FEATURES`] included.
+    #[serde(deserialize_with = "in_order::features")]
     pub features: Features,
+    /// The others.
+    #[serde(skip)]
+    pub skipped: Vec<Skipped>,
     /// What else the file says; kept as it is.
     #[serde(flatten)]
     pub more: Map<String, Value>,
@@ -175,47 +231,88 @@ fn video_file_size() -> usize {
 }
 
 /// LeRobot writes whole rates as integers and compares them as such.
-#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks for a reference")]
-fn write_fps<S: Serializer>(fps: &f64, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+fn whole_rate(fps: f64) -> Value {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole and below 2^32")]
-    if fps.fract() == 0.0 && (0.0..4e9).contains(fps) {
-        serializer.serialize_u64(*fps as u64)
-    } else {
-        serializer.serialize_f64(*fps)
+    if fps.fract() == 0.0 && (0.0..4e9).contains(&fps) { (fps as u64).into() } else { fps.into() }
+}
+
+impl Serialize for Info {
+    fn serialize<S: Serializer>(&self, s: S) -> std::result::Result<S::Ok, S::Error> {
+        let mut map = s.serialize_map(None)?;
+        map.serialize_entry("codebase_version", &self.codebase_version)?;
+        map.serialize_entry("robot_type", &self.robot_type)?;
+        map.serialize_entry("total_episodes", &self.total_episodes)?;
+        map.serialize_entry("total_frames", &self.total_frames)?;
+        map.serialize_entry("total_tasks", &self.total_tasks)?;
+        map.serialize_entry("chunks_size", &self.chunks_size)?;
+        map.serialize_entry("data_files_size_in_mb", &self.data_files_size_in_mb)?;
+        map.serialize_entry("video_files_size_in_mb", &self.video_files_size_in_mb)?;
+        map.serialize_entry("fps", &whole_rate(self.fps))?;
+        map.serialize_entry("splits", &self.splits)?;
+        map.serialize_entry("data_path", &self.data_path)?;
+        map.serialize_entry("video_path", &self.video_path)?;
+        map.serialize_entry("features", &in_order::All(self))?;
+        for (key, value) in &self.more {
+            map.serialize_entry(key, value)?;
+        }
+        map.end()
     }
 }
 
 mod in_order {
     use super::*;
 
-    pub(super) fn serialize<S: Serializer>(
-        features: &Features,
-        s: S,
-    ) -> std::result::Result<S::Ok, S::Error> {
-        s.collect_map(features.iter().map(|(name, feature)| (name, feature)))
+    /// All features, skipped ones at their old places.
+    pub(super) struct All<'a>(pub(super) &'a Info);
+
+    impl Serialize for All<'_> {
+        fn serialize<S: Serializer>(&self, s: S) -> std::result::Result<S::Ok, S::Error> {
+            let mut map = s.serialize_map(None)?;
+            let mut features = self.0.features.iter();
+            let mut skipped = self.0.skipped.iter().peekable();
+            for place in 0.. {
+                if let Some(found) = skipped.next_if(|s| s.place <= place) {
+                    map.serialize_entry(&found.name, &found.value)?;
+                } else if let Some((name, feature)) = features.next() {
+                    map.serialize_entry(name, feature)?;
+                } else if skipped.peek().is_none() {
+                    break;
+                }
+            }
+            map.end()
+        }
     }
 
-    pub(super) fn deserialize<'de, D: Deserializer<'de>>(d: D) -> std::result::Result<Features, D::Error> {
-        struct InOrder;
-        impl<'de> Visitor<'de> for InOrder {
-            type Value = Features;
-            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.write_str("a map of features")
-            }
-            fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Features, A::Error> {
-                let mut features: Features = vec![];
-                while let Some(name) = map.next_key::<String>()? {
-                    let feature: Feature =
-                        map.next_value().map_err(|e| A::Error::custom(format!("feature `{name}`: {e}")))?;
-                    if features.iter().any(|(n, _)| *n == name) {
-                        return Err(A::Error::custom(format!("feature `{name}` stands there twice")));
-                    }
-                    features.push((name, feature));
+    /// Names and what is said of each, as they follow each other.
+    pub(super) struct Entries(pub(super) Vec<(String, Value)>);
+
+    impl<'de> Deserialize<'de> for Entries {
+        fn deserialize<D: Deserializer<'de>>(d: D) -> std::result::Result<Self, D::Error> {
+            struct InOrder;
+            impl<'de> Visitor<'de> for InOrder {
+                type Value = Entries;
+                fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                    f.write_str("a map of features")
                 }
-                Ok(features)
+                fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<Entries, A::Error> {
+                    let mut found: Vec<(String, Value)> = vec![];
+                    while let Some((name, value)) = map.next_entry::<String, Value>()? {
+                        if found.iter().any(|(n, _)| *n == name) {
+                            return Err(A::Error::custom(format!("feature `{name}` stands there twice")));
+                        }
+                        found.push((name, value));
+                    }
+                    Ok(Entries(found))
+                }
             }
+            d.deserialize_map(InOrder)
         }
-        d.deserialize_map(InOrder)
+    }
+
+    /// Those of them that are features at all; [`Info::parse`] says what becomes of the others.
+    pub(super) fn features<'de, D: Deserializer<'de>>(d: D) -> std::result::Result<Features, D::Error> {
+        let entries = Entries::deserialize(d)?.0.into_iter();
+        Ok(entries.filter_map(|(name, v)| Some((name, Feature::deserialize(v).ok()?))).collect())
     }
 }
 
@@ -240,6 +337,7 @@ impl Info {
             data_path: "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet".to_owned(),
             video_path: None,
             features: features.into_iter().chain(defaults).collect(),
+            skipped: vec![],
             more: Map::new(),
         };
         match info.problem() {
@@ -258,9 +356,10 @@ impl Info {
         let json = |e: serde_json::Error| file_error(path, "JSON", "a LeRobot info.json", e.to_string());
         let Version { codebase_version: version } = serde_json::from_slice(text).map_err(json)?;
         if version != VERSION {
-            return Err(file_error(path, "codebase_version", VERSION, version));
+            return Err(unsupported(path, "codebase_version", VERSION, version));
         }
-        let info: Self = serde_json::from_slice(text).map_err(json)?;
+        let mut info: Self = serde_json::from_slice(text).map_err(json)?;
+        info.skip(text).map_err(json)?;
         if let Some((what, expected, found)) = info.problem() {
             return Err(file_error(path, &what, expected, found));
         }
@@ -277,6 +376,30 @@ impl Info {
             info.video_file("camera", 0, 0).map_err(|found| file_error(path, "video_path", INSIDE, found))?;
         }
         Ok(info)
+    }
+
+    /// Puts aside what cannot be read.
+    fn skip(&mut self, text: &[u8]) -> std::result::Result<(), serde_json::Error> {
+        #[derive(Deserialize)]
+        struct Listed {
+            features: in_order::Entries,
+        }
+        let Listed { features: in_order::Entries(entries) } = serde_json::from_slice(text)?;
+        self.features.clear();
+        for (place, (name, value)) in entries.into_iter().enumerate() {
+            let (expected, found) = match Feature::deserialize(&value) {
+                Ok(feature) => match feature.problem(self.video_path.is_some()) {
+                    Some((expected, found)) => (expected.to_owned(), found),
+                    None => {
+                        self.features.push((name, feature));
+                        continue;
+                    }
+                },
+                Err(e) => ("a type and a shape that are known".to_owned(), e.to_string()),
+            };
+            self.skipped.push(Skipped { name, expected, found, place, value });
+        }
+        Ok(())
     }
 
     /// The feature of that name.
@@ -301,29 +424,19 @@ impl Info {
         if self.chunks_size == 0 {
             return bad("chunks_size", "at least 1", "0".to_owned());
         }
-        for (i, (name, feature)) in self.features.iter().enumerate() {
+        let skipped = self.skipped.iter().map(|s| (&s.name, None));
+        let all = self.features.iter().map(|(name, feature)| (name, Some(feature)));
+        for (i, (name, feature)) in all.chain(skipped).enumerate() {
             let what = format!("feature `{name}`");
             let control = name.contains(char::is_control);
             if name.is_empty() || control || name.contains(['/', '\\']) || name == ".." || name == "." {
                 return bad(&what, "a name without `/` and control characters", format!("{name:?}"));
             }
-            if self.features[..i].iter().any(|(n, _)| n == name) {
+            if self.features.iter().take(i).any(|(n, _)| n == name) && feature.is_some() {
                 return bad(&what, "each name once", "it twice".to_owned());
             }
-            let size = feature.shape.iter().try_fold(1_usize, |a, &b| a.checked_mul(b));
-            let deep = feature.shape.len() > 5;
-            if feature.shape.is_empty() || deep || size.is_none_or(|n| n == 0 || n > LARGEST) {
-                return bad(&what, "a shape of 1 to 5 sizes, none 0", format!("{:?}", feature.shape));
-            }
-            let image = matches!(feature.shape[..], [h, w, 3] if h < 1 << 16 && w < 1 << 16);
-            if feature.is_visual() && !image {
-                return bad(&what, "an image of shape [height, width, 3]", format!("{:?}", feature.shape));
-            }
-            if feature.dtype == Dtype::String && feature.shape != [1] {
-                return bad(&what, "shape [1] for text", format!("{:?}", feature.shape));
-            }
-            if feature.dtype == Dtype::Video && self.video_path.is_none() {
-                return bad(&what, "a video_path, since there are videos", "null".to_owned());
+            if let Some((expected, found)) = feature.and_then(|f| f.problem(self.video_path.is_some())) {
+                return bad(&what, expected, found);
             }
         }
         None
@@ -406,13 +519,54 @@ mod tests {
         let other = refusal(|v| v["codebase_version"] = "v2.1".into());
         assert!(other.contains("codebase_version: expected v3.0, found v2.1"), "{other}");
         assert!(refusal(|v| v["fps"] = 0.into()).contains("fps: expected a positive rate"));
-        assert!(refusal(|v| v["features"]["z"]["shape"] = Value::from(vec![0])).contains("feature `z`"));
-        let huge = Value::from(vec![usize::MAX, 2]);
-        assert!(refusal(|v| v["features"]["z"]["shape"] = huge).contains("feature `z`"));
-        assert!(refusal(|v| v["features"]["z"]["dtype"] = "complex".into()).contains("feature `z`"));
         assert!(refusal(|v| v["features"]["index"]["dtype"] = "bool".into()).contains("int64 [1]"));
-        assert!(refusal(|v| v["features"]["z"]["dtype"] = "video".into()).contains("[height, width, 3]"));
         assert!(refusal(|v| *v = Value::Null).contains("JSON"));
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_put_aside_and_kept_as_it_is() {
+        let text = serde_json::to_string(&info()).unwrap();
+        let z = r#""z":{"dtype":"float32","shape":[2],"names":["a","b"]}"#;
+        assert!(text.contains(z), "{text}");
+        for (other, expected) in [
+            (r#""z":{"dtype":"float32","shape":[0],"names":null}"#, "none 0, found [0]"),
+            (r#""z":{"dtype":"float32","shape":[18446744073709551615,2],"names":null}"#, "a shape of 1 to 5"),
+            (r#""z":{"dtype":"complex","shape":[2],"names":null,"more":{"a":1}}"#, "complex"),
+            (r#""z":{"dtype":"image","shape":[4,4,1],"names":null}"#, "found [4, 4, 1]"),
+            (r#""z":{"dtype":"video","shape":[4,4,3],"names":null}"#, "video_path"),
+            (r#""z":{"dtype":"string","shape":[2],"names":null}"#, "shape [1] for text"),
+            (r#""z":["language"]"#, "found"),
+        ] {
+            let text = text.replace(z, other);
+            let info = Info::parse(text.as_bytes(), Path::new("x")).unwrap();
+            assert_eq!((info.features.len(), info.skipped.len()), (5, 1), "{other}");
+            let Skipped { name, expected: wanted, found, .. } = &info.skipped[0];
+            assert!(
+                name == "z" && format!("{wanted}, found {found}").contains(expected),
+                "{wanted}, {found}"
+            );
+            let back: Value = serde_json::from_str(&text).unwrap();
+            assert_eq!(serde_json::to_value(&info).unwrap(), back);
+            let written = serde_json::to_string(&info).unwrap();
+            assert!(written.find("\"z\"").unwrap() < written.find("\"timestamp\"").unwrap(), "{written}");
+        }
+        let nameless = text.replace(r#","names":["a","b"]"#, "");
+        assert_eq!(Info::parse(nameless.as_bytes(), Path::new("x")).unwrap().skipped, []);
+    }
+
+    #[test]
+    fn channels_may_come_first_or_last() {
+        let size = |shape: &[usize], names: &[&str]| {
+            let shape = shape.to_vec();
+            Feature { shape, names: names.to_vec().into(), ..Feature::image(1, 1) }.image_size()
+        };
+        assert_eq!(size(&[3, 24, 32], &["channels", "height", "width"]), Some((24, 32)));
+        assert_eq!(size(&[3, 24, 32], &[]), Some((24, 32)));
+        assert_eq!(size(&[24, 32, 3], &["height", "width", "channel"]), Some((24, 32)));
+        assert_eq!(size(&[3, 32, 3], &["channel", "height", "width"]), Some((32, 3)));
+        assert_eq!(size(&[3, 32, 3], &["height", "width", "channel"]), Some((3, 32)));
+        assert_eq!(size(&[24, 32, 1], &[]), None);
+        assert_eq!(Feature::vector(&["a"]).image_size(), None);
     }
 
     #[test]

@@ -51,7 +51,7 @@ impl ParquetFile {
                 continue;
             }
             let (mut at, length) = column.byte_range();
-            let end = at.checked_add(length).filter(|end| *end <= self.source.length);
+            let end = at.checked_add(length).filter(|end| *end <= self.source.end());
             let Some(end) = end else { return Err(format!("a column of {length} bytes from byte {at} on")) };
             let texts = column.column_type() == Type::BYTE_ARRAY;
             // A dictionary's longest text may stand in every row.

@@ -15,6 +15,7 @@ mod episode;
 mod episodes;
 mod feature;
 mod limits;
+mod mp4;
 mod parquet_file;
 mod picture;
 mod promises;
@@ -25,14 +26,14 @@ mod tasks;
 mod video;
 mod writer;
 
-pub use check::{Fault, REMOVED, Report, check, repair};
+pub use check::{Fault, FaultKind, REMOVED, Report, check, repair};
 pub use dataset::Dataset;
 pub use episode::{
     ACTION_NAMES, EXCURSION_NAMES, SOURCE_EXCURSION, SOURCE_FATE, SOURCE_FRAME, STATE_NAMES, features,
     features_of, from_table, source_columns, source_features, to_table,
 };
 pub use episodes::{EpisodeSpan, VideoSpan};
-pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Info, VERSION};
+pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Info, Skipped, VERSION};
 pub use picture::{decode_image as decode_png, encode as encode_png};
 pub use robot::{ColumnSlice, RobotColumns, Rotation};
 pub use stats::{FeatureStats, QUANTILES, Stats};

@@ -5,7 +5,7 @@ use super::limits::{BYTES, Promised, VALUES};
 use super::promises;
 use super::table::Column;
 use crate::atomic::{io, persist, unfinished};
-use crate::file::file_error;
+use crate::file::{file_error, open_regular, unsupported};
 use crate::{Error, Result};
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
@@ -24,7 +24,7 @@ use parquet::arrow::arrow_reader::{
 use parquet::arrow::{ArrowWriter, ProjectionMask};
 use parquet::basic::Compression;
 use parquet::errors::ParquetError;
-use parquet::file::metadata::{KeyValue, ParquetMetaDataReader};
+use parquet::file::metadata::{ColumnChunkMetaData, KeyValue, ParquetMetaDataReader, RowGroupMetaData};
 use parquet::file::properties::{EnabledStatistics, WriterProperties};
 use parquet::file::reader::{ChunkReader, Length};
 use sha2::{Digest, Sha256};
@@ -40,6 +40,8 @@ use tempfile::NamedTempFile;
 const CHECKSUMS: &str = "auto_e2h.sha256";
 /// Rows decoded at once: images of some seconds.
 const BATCH: usize = 64;
+/// Bytes of a footer: far above any dataset's, and what may be read at once.
+const LARGEST_FOOTER: u32 = 1 << 28;
 /// What a footer ends with.
 const MAGIC: &[u8; 4] = b"PAR1";
 /// What a damaged file should have been.
@@ -52,16 +54,26 @@ pub(crate) struct ParquetFile {
     pub(crate) path: PathBuf,
     pub(super) source: Source,
     pub(super) metadata: ArrowReaderMetadata,
+    /// Whether columns have the types that the writer says, and not only Parquet's own.
+    as_written: bool,
 }
 
 /// The bytes of a file, read by their place: threads that share it do not move each other.
 #[derive(Clone)]
 pub(super) struct Source {
     file: Arc<File>,
+    /// Bytes of the file.
     pub(super) length: u64,
+    /// What has been unpacked of it in memory, as if it followed the file.
+    pub(super) unpacked: Arc<Vec<u8>>,
 }
 
 impl Source {
+    /// Bytes in all.
+    pub(super) fn end(&self) -> u64 {
+        self.length + self.unpacked.len() as u64
+    }
+
     /// All bytes from `start` on.
     pub(super) fn from(&self, start: u64) -> BufReader<Place> {
         BufReader::new(Place { source: self.clone(), at: start })
@@ -69,7 +81,7 @@ impl Source {
 
     pub(super) fn bytes(&self, start: u64, length: usize) -> std::io::Result<Vec<u8>> {
         let end = start.checked_add(length as u64);
-        if end.is_none_or(|end| end > self.length) {
+        if end.is_none_or(|end| end > self.end()) {
             return Err(std::io::ErrorKind::UnexpectedEof.into());
         }
         let mut bytes = vec![0; length];
@@ -86,6 +98,16 @@ pub(super) struct Place {
 
 impl Read for Place {
     fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        if let Some(at) = self.at.checked_sub(self.source.length) {
+            let at = usize::try_from(at).unwrap_or(usize::MAX);
+            let read = self.source.unpacked.get(at..).unwrap_or_default().read(bytes)?;
+            self.at += read as u64;
+            return Ok(read);
+        }
+        // Up to the end that was measured: behind it lies what was unpacked.
+        let left = usize::try_from(self.source.length - self.at).unwrap_or(usize::MAX);
+        let most = bytes.len().min(left);
+        let bytes = &mut bytes[..most];
         #[cfg(unix)]
         let read = std::os::unix::fs::FileExt::read_at(&*self.source.file, bytes, self.at)?;
         #[cfg(windows)]
@@ -97,7 +119,7 @@ impl Read for Place {
 
 impl Length for Source {
     fn len(&self) -> u64 {
-        self.length
+        self.end()
     }
 }
 
@@ -121,17 +143,18 @@ fn guard<T>(path: &Path, what: &str, run: impl FnOnce() -> Result<T>) -> Result<
 
 impl ParquetFile {
     pub(crate) fn open(path: &Path) -> Result<Self> {
-        let file = File::open(path).map_err(io("open", path))?;
+        let file = open_regular(path)?;
         let length = file.metadata().map_err(io("open", path))?.len();
-        let source = Source { file: Arc::new(file), length };
+        let source = Source { file: Arc::new(file), length, unpacked: Arc::default() };
         let broken = |found: String| file_error(path, "file", WHOLE, found);
         let footer = footer(&source, path)?;
         promises::footer(&footer).map_err(broken)?;
         let metadata = guard(path, "file", || {
             let metadata = ParquetMetaDataReader::decode_metadata(&footer);
             let metadata = metadata.map_err(|e| broken(e.to_string()))?;
-            ArrowReaderMetadata::try_new(Arc::new(metadata), ArrowReaderOptions::new())
-                .map_err(|e| broken(e.to_string()))
+            // By Parquet's own types: what a writer calls a large list, a dictionary or a view is then what it is here.
+            let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
+            ArrowReaderMetadata::try_new(Arc::new(metadata), options).map_err(|e| broken(e.to_string()))
         })?;
         let rows = metadata.metadata().file_metadata().num_rows();
         let mut groups = metadata.metadata().row_groups().iter().map(|g| u64::try_from(g.num_rows()).ok());
@@ -145,7 +168,7 @@ impl ParquetFile {
                 format!("{found} in its row groups"),
             ));
         }
-        let this = Self { path: path.to_owned(), source, metadata };
+        let this = Self { path: path.to_owned(), source, metadata, as_written: false };
         match sum {
             Some(rows) if rows > this.most(VALUES) => {
                 Err(file_error(path, "file", this.fewer(VALUES, "rows"), format!("{rows}")))
@@ -189,23 +212,27 @@ impl ParquetFile {
             done = next;
         }
         let Some(first) = first else { return Ok(()) };
+        for &group in &wanted {
+            self.check_packing(group, columns)?;
+        }
         let what = |from: usize| {
             let names = columns.iter().map(|c| format!("`{c}`")).collect::<Vec<_>>().join(", ");
             format!("column {names}, from row {from}")
         };
         let mut next = rows.start;
         let result = guard(&self.path, &what(rows.start), || {
-            let (source, metadata) = (self.source.clone(), self.metadata.clone());
-            let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(source, metadata);
-            let schema = builder.schema().clone();
+            let schema = self.metadata.schema();
             let places = columns.iter().filter_map(|c| schema.index_of(c).ok());
-            let mask = ProjectionMask::roots(builder.parquet_schema(), places);
+            let mask = ProjectionMask::roots(self.metadata.parquet_schema(), places);
             let broken = |from, e: String| file_error(&self.path, &what(from), "readable values", e);
+            let unpacked = self.unpack(&wanted, &mask).map_err(|e| broken(rows.start, e))?;
+            let this = unpacked.as_ref().unwrap_or(self);
             let mut promised = Promised::default();
             for &group in &wanted {
-                self.look(group, &mask, &mut promised).map_err(|e| broken(rows.start, e))?;
+                this.look(group, &mask, &mut promised).map_err(|e| broken(rows.start, e))?;
             }
-            let reader = builder
+            let (source, metadata) = (this.source.clone(), this.metadata.clone());
+            let reader = ParquetRecordBatchReaderBuilder::new_with_metadata(source, metadata)
                 .with_projection(mask)
                 .with_row_groups(wanted)
                 .with_offset(rows.start - first)
@@ -299,28 +326,172 @@ impl ParquetFile {
         rows(&groups[..i])..rows(&groups[..=i])
     }
 
-    /// The first `ends.last()` rows as a new file at the same place, one row group up to each of `ends`.
-    pub(crate) fn truncate(&self, ends: &[usize]) -> Result<()> {
-        let schema = self.schema();
-        let columns: Vec<&str> = schema.fields().iter().map(|f| f.name().as_str()).collect();
-        let mut writer = ParquetWriter::create(&self.path, schema.clone())?;
+    /// The first `ends.last()` rows as a new file at the same place, one row group up to each of `ends`: the columns that
+    /// `wanted` wants, as `change` makes them of batches that begin at a row. What the writer said of the columns stays.
+    pub(crate) fn rewrite(
+        &self,
+        ends: &[usize],
+        wanted: &dyn Fn(&str) -> bool,
+        change: &mut dyn FnMut(&RecordBatch, usize) -> Result<RecordBatch>,
+    ) -> Result<()> {
+        let full = self.as_written()?;
+        let described = full.metadata.schema().clone();
+        let columns: Vec<&str> =
+            described.fields().iter().map(|f| f.name().as_str()).filter(|n| wanted(n)).collect();
+        let same = |e: arrow_schema::ArrowError| {
+            file_error(&self.path, "columns", "those of the file", e.to_string())
+        };
+        let mut open: Option<(ParquetWriter, SchemaRef)> = None;
         let mut start = 0;
         for &end in ends {
-            self.batches(&columns, start..end, &mut |batch, _| {
-                let batch = batch.clone().with_schema(schema.clone());
-                let same = |e: arrow_schema::ArrowError| {
-                    file_error(&self.path, "columns", "those of the file", e.to_string())
+            full.batches(&columns, start..end, &mut |batch, first| {
+                let batch = change(batch, first)?;
+                let (writer, schema) = match &mut open {
+                    Some(open) => open,
+                    None => {
+                        let schema = batch.schema().as_ref().clone();
+                        let schema = Arc::new(schema.with_metadata(described.metadata().clone()));
+                        open.insert((ParquetWriter::create(&self.path, schema.clone())?, schema))
+                    }
                 };
-                writer.add(&batch.map_err(same)?)
+                writer.add(&batch.with_schema(schema.clone()).map_err(same)?)
             })?;
-            writer.close_group()?;
+            if let Some((writer, _)) = &mut open {
+                writer.close_group()?;
+            }
             start = end;
         }
-        writer.finish()
+        match open {
+            Some((writer, _)) => writer.finish(),
+            None => Err(file_error(&self.path, "file", "rows to keep", "none")),
+        }
     }
 
-    fn schema(&self) -> SchemaRef {
-        self.metadata.schema().clone()
+    /// The same file, with columns of the types that its writer says.
+    fn as_written(&self) -> Result<Self> {
+        guard(&self.path, "schema", || {
+            let metadata = self.metadata.metadata().clone();
+            let full = ArrowReaderMetadata::try_new(metadata, ArrowReaderOptions::new());
+            let metadata = full.map_err(|e| unsupported(&self.path, "schema", "Arrow's", e.to_string()))?;
+            Ok(Self { path: self.path.clone(), source: self.source.clone(), metadata, as_written: true })
+        })
+    }
+
+    /// Refuses by name what is packed in a way that is not read here.
+    fn check_packing(&self, group: usize, columns: &[&str]) -> Result<()> {
+        for column in self.metadata.metadata().row_group(group).columns() {
+            let Some(name) = column.column_path().parts().first() else { continue };
+            let known = matches!(
+                column.compression(),
+                Compression::UNCOMPRESSED | Compression::SNAPPY | Compression::ZSTD(_)
+            );
+            if !known && columns.contains(&name.as_str()) {
+                let what = format!("column `{name}`");
+                let found = format!("{:?}", column.compression());
+                return Err(unsupported(&self.path, &what, "snappy, zstd or no packing", found));
+            }
+        }
+        Ok(())
+    }
+
+    /// This file with the zstd pages of some columns unpacked in memory; none where there are no such pages.
+    fn unpack(
+        &self,
+        groups: &[usize],
+        columns: &ProjectionMask,
+    ) -> std::result::Result<Option<Self>, String> {
+        let metadata = self.metadata.metadata();
+        let mut unpacked = vec![];
+        let mut all: Option<Vec<RowGroupMetaData>> = None;
+        for &group in groups {
+            let packed = |(i, c): &(usize, &ColumnChunkMetaData)| {
+                columns.leaf_included(*i) && matches!(c.compression(), Compression::ZSTD(_))
+            };
+            let chunks: Vec<_> =
+                metadata.row_group(group).columns().iter().enumerate().filter(packed).collect();
+            for (i, chunk) in chunks {
+                let plain = self.unpack_chunk(chunk, &mut unpacked)?;
+                let all = all.get_or_insert_with(|| metadata.row_groups().to_vec());
+                let mut columns = all[group].columns().to_vec();
+                columns[i] = plain;
+                let built = all[group].clone().into_builder().set_column_metadata(columns).build();
+                all[group] = built.map_err(|e| e.to_string())?;
+            }
+        }
+        let Some(all) = all else { return Ok(None) };
+        let metadata = metadata.as_ref().clone().into_builder().set_row_groups(all).build();
+        let options = ArrowReaderOptions::new().with_skip_arrow_metadata(!self.as_written);
+        let metadata =
+            ArrowReaderMetadata::try_new(Arc::new(metadata), options).map_err(|e| e.to_string())?;
+        let source = Source { unpacked: Arc::new(unpacked), ..self.source.clone() };
+        Ok(Some(Self { path: self.path.clone(), source, metadata, as_written: self.as_written }))
+    }
+
+    /// Adds the pages of one column to `out`, unpacked, and says where they are now.
+    fn unpack_chunk(
+        &self,
+        chunk: &ColumnChunkMetaData,
+        out: &mut Vec<u8>,
+    ) -> std::result::Result<ColumnChunkMetaData, String> {
+        let (mut at, length) = chunk.byte_range();
+        let end = at.checked_add(length).filter(|end| *end <= self.source.length);
+        let end = end.ok_or_else(|| format!("a column of {length} bytes from byte {at} on"))?;
+        let start = out.len();
+        let mut data = None;
+        while at < end {
+            let page = promises::page(self.source.from(at), end - at)?;
+            let left = end - at - page.header;
+            if page.stored > left {
+                return Err(format!("a page of {} bytes where {left} are left", page.stored));
+            }
+            if page.unpacked > self.most(BYTES).saturating_sub(out.len() as u64) {
+                return Err(format!("more, expected {}", self.fewer(BYTES, "bytes")));
+            }
+            let read = |from, length: u64| {
+                self.source
+                    .bytes(from, usize::try_from(length).unwrap_or(usize::MAX))
+                    .map_err(|e| e.to_string())
+            };
+            let (header, body) = (read(at, page.header)?, read(at + page.header, page.stored)?);
+            let body = unpack_page(&body, &page)?;
+            let size = i32::try_from(body.len()).map_err(|_| "a page of more than 2 GiB".to_owned())?;
+            if !page.dictionary {
+                data.get_or_insert(out.len());
+            }
+            out.extend(promises::restate(&header, size, crc32fast::hash(&body))?);
+            out.extend(body);
+            at += page.header + page.stored;
+        }
+        let place = |at: usize| i64::try_from(self.source.length + at as u64).unwrap_or(i64::MAX);
+        let dictionary = chunk.dictionary_page_offset().map(|_| place(start));
+        let data = if dictionary.is_some() { data.unwrap_or(start) } else { start };
+        let builder = chunk.clone().into_builder();
+        let builder = builder.set_compression(Compression::UNCOMPRESSED).set_index_page_offset(None);
+        let builder = builder.set_total_compressed_size(i64::try_from(out.len() - start).unwrap_or(i64::MAX));
+        let builder = builder.set_dictionary_page_offset(dictionary).set_data_page_offset(place(data));
+        builder.build().map_err(|e| e.to_string())
+    }
+}
+
+/// The bytes of a page, unpacked. Levels of the second version of pages are never packed.
+fn unpack_page(body: &[u8], page: &promises::Page) -> std::result::Result<Vec<u8>, String> {
+    let levels = usize::try_from(page.levels).ok().and_then(|n| body.split_at_checked(n));
+    let (levels, packed) = levels.ok_or_else(|| format!("levels of {} bytes", page.levels))?;
+    let mut out = levels.to_vec();
+    if page.plain {
+        out.extend_from_slice(packed);
+    } else if !packed.is_empty() {
+        let failed = |e: String| format!("a page that zstd cannot unpack: {e}");
+        let decoder = ruzstd::decoding::StreamingDecoder::new(packed).map_err(|e| failed(e.to_string()))?;
+        let left = page.unpacked.saturating_sub(page.levels);
+        // One byte more shows whether there are more.
+        decoder.take(left + 1).read_to_end(&mut out).map_err(|e| failed(e.to_string()))?;
+    }
+    let found = out.len() as u64;
+    if found == page.unpacked {
+        Ok(out)
+    } else {
+        Err(format!("a page of {found} bytes, not {}", page.unpacked))
     }
 }
 
@@ -333,10 +504,17 @@ fn footer(source: &Source, path: &Path) -> Result<Vec<u8>> {
     }
     let end = source.bytes(source.length - 8, 8).map_err(&read)?;
     let (length, magic) = end.split_at(4);
+    if magic == b"PARE" {
+        return Err(unsupported(path, "file", "an open Parquet file", "an encrypted one"));
+    }
     if magic != MAGIC {
         return Err(broken(format!("an end of {magic:?}")));
     }
     let length = length.first_chunk().map_or(0, |b| u32::from_le_bytes(*b));
+    if length > LARGEST_FOOTER {
+        let most = format!("a footer of at most {LARGEST_FOOTER} bytes");
+        return Err(unsupported(path, "file", most, length.to_string()));
+    }
     match (source.length - 8).checked_sub(length.into()) {
         Some(start) if start >= 4 => source.bytes(start, length as usize).map_err(&read),
         _ => Err(broken(format!("a footer of {length} bytes in a file of {}", source.length))),
@@ -452,6 +630,11 @@ impl Cell<'_> {
         file_error(self.path, &what, expected, found)
     }
 
+    /// For what may be whole.
+    fn unsupported(&self, expected: impl Into<String>, found: impl Into<String>) -> Error {
+        unsupported(self.path, &format!("column `{}`", self.column), expected, found)
+    }
+
     /// Refuses missing values; `width` of them make a row.
     fn whole(&self, array: &dyn Array, width: usize) -> Result<()> {
         match (0..array.len()).find(|&i| array.null_count() > 0 && array.is_null(i)) {
@@ -479,7 +662,7 @@ fn from_arrow(array: &ArrayRef, feature: &Feature, place: &Cell) -> Result<Colum
     if leaf.len() != rows * width {
         return Err(place.error(None, format!("{width} numbers a row"), leaf.len().to_string()));
     }
-    let found = || place.error(None, feature.describe(), array.data_type().to_string());
+    let found = || place.unsupported(feature.describe(), array.data_type().to_string());
     fn values<T: ArrowPrimitiveType>(leaf: &ArrayRef) -> &[T::Native] {
         leaf.as_primitive::<T>().values()
     }
@@ -553,12 +736,12 @@ fn unpack(array: &ArrayRef, size: usize, width: usize, feature: &Feature, place:
             }
             Ok(list.values().slice(list.offset() * size, list.len() * size))
         }
-        other => Err(place.error(None, feature.describe(), other.to_string())),
+        other => Err(place.unsupported(feature.describe(), other.to_string())),
     }
 }
 
 fn images(array: &ArrayRef, place: &Cell) -> Result<Column> {
-    let kind = || place.error(None, "images as struct<bytes, path>", array.data_type().to_string());
+    let kind = || place.unsupported("images as struct<bytes, path>", array.data_type().to_string());
     let bytes = match array.data_type() {
         DataType::Struct(_) => {
             place.whole(array.as_ref(), 1)?;
@@ -567,7 +750,9 @@ fn images(array: &ArrayRef, place: &Cell) -> Result<Column> {
         _ => array.clone(),
     };
     // Bytes may be left out for a path to a file of the recorder's machine; that file is not part of the dataset.
-    place.whole(bytes.as_ref(), 1)?;
+    if bytes.null_count() > 0 {
+        return Err(place.unsupported("images in the file", "paths to other files"));
+    }
     match bytes.data_type() {
         DataType::Binary => Ok(Column::Png(bytes.as_binary::<i32>().values_in_rows())),
         DataType::LargeBinary => Ok(Column::Png(bytes.as_binary::<i64>().values_in_rows())),
@@ -645,6 +830,27 @@ fn pictures(files: &[Vec<u8>]) -> ArrayRef {
         Field::new("path", DataType::Utf8, true),
     ]);
     Arc::new(StructArray::new(fields, vec![Arc::new(bytes) as ArrayRef, Arc::new(path)], None))
+}
+
+/// A column of plain numbers.
+pub(crate) fn plain(column: &Column) -> ArrayRef {
+    let dtype = if matches!(column, Column::F32(_)) { Dtype::Float32 } else { Dtype::Int64 };
+    to_arrow(&Feature::scalar(dtype), column)
+}
+
+/// The batch with some columns replaced, and those added that it does not have.
+pub(crate) fn replace_columns(
+    old: &RecordBatch,
+    mut new: Vec<(String, ArrayRef)>,
+    path: &Path,
+) -> Result<RecordBatch> {
+    let mut columns = vec![];
+    for (field, column) in old.schema().fields().iter().zip(old.columns()) {
+        let place = new.iter().position(|(n, _)| n == field.name());
+        columns.push(place.map_or_else(|| (field.name().clone(), column.clone()), |i| new.remove(i)));
+    }
+    columns.extend(new);
+    batch(columns, path)
 }
 
 /// A batch of columns that may all be missing values, as pandas and pyarrow write them.

@@ -1,9 +1,18 @@
 //! Images as PNG files, which is how they lie in Parquet columns.
 
 use crate::Result;
-use crate::file::file_error;
+use crate::file::{file_error, unsupported};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
+use zune_jpeg::zune_core::bytestream::ZCursor;
+use zune_jpeg::zune_core::colorspace::ColorSpace;
+use zune_jpeg::zune_core::options::DecoderOptions;
 
+/// What JPEG files begin with.
+const JPEG: &[u8] = &[0xff, 0xd8, 0xff];
+/// What files of other formats begin with, which are whole and not read here.
+const OTHERS: [(&[u8], &str); 5] =
+    [(b"RIFF", "WebP"), (b"GIF8", "GIF"), (b"BM", "BMP"), (b"II*\0", "TIFF"), (b"MM\0*", "TIFF")];
 /// Bytes that one byte of a PNG file makes at most, by how it is packed.
 const DENSEST: usize = 1032;
 /// Bytes of pixels that no file is refused for.
@@ -35,23 +44,30 @@ pub fn encode(height: usize, width: usize, data: &[u8]) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// The image in a PNG file of known size, as a column holds them. Grey becomes RGB, transparency is dropped.
+/// The image in a PNG or JPEG file of known size, as a column holds them. Grey becomes RGB, transparency is dropped.
 ///
 /// # Errors
-/// When it is no PNG file or of another size; `what` says which one it is.
+/// When it is neither or of another size; `what` says which one it is.
 pub fn decode_image(file: &[u8], height: usize, width: usize, what: &str) -> Result<e2h_core::Image> {
     let data = decode(file, height, width, Path::new("(dataset)"), what)?;
     Ok(e2h_core::Image { height, width, data })
 }
 
-/// The pixels of a PNG file of known size. Grey becomes RGB, transparency is dropped, 16 bits become 8.
+/// The pixels of a PNG or JPEG file of known size. Grey becomes RGB, transparency is dropped, 16 bits become 8.
 ///
 /// # Shapes
 /// The result is (height, width, 3).
 ///
 /// # Errors
-/// When it is no PNG file or of another size; `path` and `what` say where it lay.
+/// When it is damaged or of another size, or by another kind when it is a file of another format; `path` and `what` say
+/// where it lay.
 pub(super) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
+    if bytes.starts_with(JPEG) {
+        return decode_jpeg(bytes, height, width, path, what);
+    }
+    if let Some((_, name)) = OTHERS.iter().find(|(magic, _)| bytes.starts_with(magic)) {
+        return Err(unsupported(path, what, "a PNG or JPEG image", format!("a {name} file")));
+    }
     let bad = |found: String| file_error(path, what, format!("a PNG image of {height} x {width}"), found);
     let broken = |e: png::DecodingError| bad(e.to_string());
     let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));
@@ -83,6 +99,31 @@ pub(super) fn decode(bytes: &[u8], height: usize, width: usize, path: &Path, wha
     if rgb.len() == height * width * 3 { Ok(rgb) } else { Err(bad(format!("{} bytes of pixels", rgb.len()))) }
 }
 
+/// As [`decode`], of a JPEG file.
+fn decode_jpeg(bytes: &[u8], height: usize, width: usize, path: &Path, what: &str) -> Result<Vec<u8>> {
+    let bad = |found: String| file_error(path, what, format!("a JPEG image of {height} x {width}"), found);
+    let run = || {
+        let options = DecoderOptions::new_safe().jpeg_set_out_colorspace(ColorSpace::RGB);
+        let options = options.set_strict_mode(true).set_max_width(width).set_max_height(height);
+        let mut decoder = zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(bytes), options);
+        // The size before any pixel: a file of a few bytes may promise gigabytes.
+        decoder.decode_headers().map_err(|e| bad(e.to_string()))?;
+        let found = decoder.dimensions().unwrap_or((0, 0));
+        if found != (width, height) {
+            return Err(bad(format!("{} x {}", found.1, found.0)));
+        }
+        let rgb = decoder.decode().map_err(|e| bad(e.to_string()))?;
+        if rgb.len() == height * width * 3 {
+            Ok(rgb)
+        } else {
+            Err(bad(format!("{} bytes of pixels", rgb.len())))
+        }
+    };
+    // Not this project's decoder: damaged bytes may make it panic.
+    catch_unwind(AssertUnwindSafe(run))
+        .unwrap_or_else(|_| Err(bad("bytes that the decoder stumbles over".into())))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -101,6 +142,28 @@ mod tests {
         assert_eq!(message, "x: row 0: expected a PNG image of 6 x 4, found 4 x 6");
         assert!(encode(4, 6, &data[1..]).is_err());
         assert!(from(b"\xff\xd8\xff\xe0 JFIF", 4, 6).is_err());
+    }
+
+    /// Made with Pillow 12: `Image.new("RGB", (12, 8), (200, 100, 50)).save("plain.jpg", quality=90)`.
+    #[test]
+    fn jpeg_files_are_read_and_other_formats_are_named() {
+        let file = include_bytes!("../../../../tests/golden/lerobot/packed/plain.jpg");
+        let pixels = from(file, 8, 12).unwrap();
+        assert_eq!(pixels.len(), 8 * 12 * 3);
+        for pixel in pixels.chunks_exact(3) {
+            assert!(pixel.iter().zip([200_u8, 100, 50]).all(|(a, b)| a.abs_diff(b) < 4), "{pixel:?}");
+        }
+        let other = from(file, 12, 8).unwrap_err();
+        assert!(!other.is_unsupported(), "{other}");
+        for length in 0..file.len() {
+            // What is cut off in the middle of its pixels may be an image all the same, of the size that is asked for.
+            if let Ok(pixels) = from(&file[..length], 8, 12) {
+                assert_eq!(pixels.len(), 8 * 12 * 3);
+            }
+        }
+        let webp = from(b"RIFF\x24\0\0\0WEBPVP8 ", 8, 12).unwrap_err();
+        assert!(webp.is_unsupported() && webp.to_string().contains("found a WebP file"), "{webp}");
+        assert!(!from(b"nothing", 8, 12).unwrap_err().is_unsupported());
     }
 
     #[test]

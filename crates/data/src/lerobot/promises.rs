@@ -346,6 +346,10 @@ pub(super) struct Page {
     /// Values in it; for a page of a dictionary, those of the dictionary.
     pub(super) values: u64,
     pub(super) dictionary: bool,
+    /// Bytes of levels before the values that are not packed with them.
+    pub(super) levels: u64,
+    /// Whether its values are not packed, whatever the column says.
+    pub(super) plain: bool,
     /// Whether texts may begin with as much of the one before as they like.
     pub(super) shares_prefixes: bool,
 }
@@ -383,6 +387,13 @@ pub(super) fn page(input: impl Read, left: u64) -> Result<Page, Wrong> {
                     page.values = page.values.max(size(walker.signed()?)?);
                     return Ok(());
                 }
+                if id == 8 && (inner == 5 || inner == 6) && (4..=6).contains(&wire) {
+                    page.levels = page.levels.saturating_add(size(walker.signed()?)?);
+                    return Ok(());
+                }
+                if id == 8 && inner == 7 {
+                    page.plain = wire == 2;
+                }
                 let encoding = if id == 8 { 4 } else { 2 };
                 if inner == encoding && (4..=6).contains(&wire) {
                     page.shares_prefixes |= walker.signed()? == DELTA_BYTE_ARRAY;
@@ -395,6 +406,47 @@ pub(super) fn page(input: impl Read, left: u64) -> Result<Page, Wrong> {
     })?;
     page.header = left - walker.left;
     Ok(page)
+}
+
+/// The header of a page that has been read by [`page`], for the same page in `stored` bytes with the checksum `sum`.
+pub(super) fn restate(header: &[u8], stored: i32, sum: u32) -> Result<Vec<u8>, Wrong> {
+    let number = |out: &mut Vec<u8>, v: i32| {
+        let mut v = ((v << 1) ^ (v >> 31)).cast_unsigned();
+        while v >= 0x80 {
+            out.push((v & 0x7f) as u8 | 0x80);
+            v >>= 7;
+        }
+        out.push(v as u8);
+    };
+    let mut out = Vec::with_capacity(header.len() + 8);
+    let (mut at, mut id) = (0, 0);
+    // Kind, both sizes and the checksum are the first four fields, and numbers; what follows is not touched.
+    loop {
+        let Some(&head) = header.get(at) else { return wrong("a header that is cut off") };
+        id += head >> 4;
+        if head >> 4 == 0 || id > 4 {
+            if id < 3 {
+                return wrong("a header without sizes");
+            }
+            out.extend_from_slice(&header[at..]);
+            return Ok(out);
+        }
+        let length = header[at + 1..].iter().position(|b| *b < 0x80);
+        let Some(length) = length else { return wrong("a header that is cut off") };
+        let end = at + length + 2;
+        match id {
+            3 => {
+                out.push(head);
+                number(&mut out, stored);
+            }
+            4 => {
+                out.push(head);
+                number(&mut out, sum.cast_signed());
+            }
+            _ => out.extend_from_slice(&header[at..end]),
+        }
+        at = end;
+    }
 }
 
 #[cfg(test)]
@@ -460,6 +512,18 @@ mod tests {
         assert!(footer(&field(3, 8, &[0])).unwrap_err().contains("type 8"));
         let twice = [field(2, 9, &[0x0c]), field(0, 9, &[4, 0x0c])].concat();
         assert_eq!(footer(&twice).unwrap_err(), "fields out of order");
+    }
+
+    #[test]
+    fn a_header_is_restated_with_another_size_and_checksum() {
+        let whole = |stored: i32, sum: i32| {
+            let data = [field(1, 5, &zigzag(7)), field(1, 5, &[0]), vec![0]].concat();
+            let sizes = [field(1, 5, &[0]), field(1, 5, &zigzag(500)), field(1, 5, &zigzag(stored))].concat();
+            [sizes, field(1, 5, &zigzag(sum)), field(1, 12, &data), vec![0]].concat()
+        };
+        assert_eq!(restate(&whole(60, 1), 500, u32::MAX).unwrap(), whole(500, -1));
+        let header = whole(60, 1);
+        assert!((0..7).all(|n| restate(&header[..n], 1, 1).is_err()));
     }
 
     #[test]

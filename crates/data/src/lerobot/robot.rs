@@ -3,7 +3,7 @@
 use super::feature::Info;
 use super::table::{Table, column_error};
 use crate::{Error, Result};
-use e2h_core::{Episode, Origin, Outcome, align_hemisphere};
+use e2h_core::{Episode, Origin, Outcome, align_hemisphere, continue_signs};
 use std::str::FromStr;
 
 /// Some entries of a column, written `name`, `name[3]` or `name[0:7]`.
@@ -215,8 +215,8 @@ impl RobotColumns {
         Ok(())
     }
 
-    /// The recording as an episode without images and with empty actions, to be reversed. Orientations lie in the hemisphere
-    /// of `reference` (wxyz), openings are scaled to `open_width`, m. An unknown object lies at the origin.
+    /// The recording as an episode without images and with empty actions, to be reversed. The first orientation lies in the
+    /// hemisphere of `reference` (wxyz), the others go on from it without a jump of the sign; openings are scaled to `open_width`, m. An unknown object lies at the origin.
     ///
     /// # Errors
     /// When a column is missing, or a row holds no pose.
@@ -250,6 +250,8 @@ impl RobotColumns {
                 .push(&observation, &[0.0; 8])
                 .map_err(|source| Error::Episode { name: "recording".into(), source })?;
         }
+        continue_signs(&mut episode.state, 3..7, reference);
+        continue_signs(&mut episode.state, 10..14, reference);
         episode.outcome = Outcome::Success { at: episode.len().saturating_sub(1) };
         episode.validate().map_err(|source| Error::Episode { name: "recording".into(), source })?;
         Ok(episode)

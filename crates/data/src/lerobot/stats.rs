@@ -71,7 +71,7 @@ fn of_numbers(values: &[f64], rows: usize, feature: &Feature) -> FeatureStats {
 
 /// LeRobot looks at a part of the images, and at a part of the pixels of large ones.
 fn of_images(files: &[Vec<u8>], feature: &Feature, name: &str) -> Result<Option<FeatureStats>> {
-    let [height, width, _] = feature.shape[..] else { return Ok(None) };
+    let Some((height, width)) = feature.image_size() else { return Ok(None) };
     let sampled = sampled_rows(files.len());
     let step = if height.max(width) < 300 { 1 } else { height.max(width) / 150 };
     let mut counts = vec![[0_u64; 256]; 3];

@@ -502,7 +502,7 @@ fn wrong_numbers_beside_the_rows_are_found() {
     assert_holds(&root, 5);
     edit(&root, "meta/info.json", "\"fps\": 20", "\"fps\": 25");
     let found = faults(&root);
-    assert!(found[0].contains("column `timestamp`, row 1: expected 0.04, found 0.05"), "{found:?}");
+    assert!(found[0].contains("column `timestamp`, row 2: expected 0.08, found 0.1"), "{found:?}");
     edit(&root, "meta/info.json", "v3.0", "v2.1");
     assert!(faults(&root)[0].contains("expected v3.0, found v2.1"));
     assert!(repair(&root).unwrap().repairs.is_empty(), "what cannot be repaired is left alone");
@@ -515,8 +515,10 @@ fn a_foreign_column_type_is_named_with_its_column() {
     let text = std::fs::read_to_string(root.join("meta/info.json")).unwrap();
     let text = text.replacen("\"dtype\": \"image\"", "\"dtype\": \"video\"", 1);
     std::fs::write(root.join("meta/info.json"), text).unwrap();
-    let message = Dataset::open(&root).unwrap_err().to_string();
-    assert!(message.contains("video_path"), "{message}");
+    let dataset = Dataset::open(&root).unwrap();
+    let name = dataset.info().skipped[0].name.clone();
+    let message = dataset.read_columns(0, &[name.as_str()]).unwrap_err().to_string();
+    assert!(message.contains("video_path") && message.contains(&name), "{message}");
 
     let (_folder, root) = place();
     written(&root, 1).finish().unwrap();
@@ -530,6 +532,234 @@ fn a_foreign_column_type_is_named_with_its_column() {
     std::fs::write(root.join("meta/info.json"), wrong).unwrap();
     let message = Dataset::open(&root).unwrap().read(0).unwrap_err().to_string();
     assert!(message.contains("column `action`, row 0: expected 9 entries, found 8"), "{message}");
+}
+
+/// Replaces columns of a file of a dataset, as another program would: the checksums are right.
+fn replace(path: &Path, columns: Vec<(&str, arrow_array::ArrayRef)>) {
+    use super::parquet_file::{ParquetFile, replace_columns};
+    let file = ParquetFile::open(path).unwrap();
+    let rows = file.rows();
+    let change = &mut |batch: &arrow_array::RecordBatch, first| {
+        let piece = |c: &arrow_array::ArrayRef| c.slice(first, batch.num_rows());
+        replace_columns(batch, columns.iter().map(|(n, c)| ((*n).to_owned(), piece(c))).collect(), path)
+    };
+    file.rewrite(&[rows], &|_| true, change).unwrap();
+}
+
+fn integers(values: impl IntoIterator<Item = i64>) -> arrow_array::ArrayRef {
+    std::sync::Arc::new(arrow_array::Int64Array::from_iter_values(values))
+}
+
+fn kinds(report: &Report) -> Vec<FaultKind> {
+    let mut kinds: Vec<FaultKind> = report.faults.iter().map(|f| f.kind).collect();
+    kinds.dedup();
+    kinds
+}
+
+/// Merging, deleting and splitting leave places and statistics as they were, and clocks are not exact. No row is lost by that.
+#[test]
+fn what_is_stale_is_taken_anew_from_the_rows() {
+    let list = "meta/episodes/chunk-000/file-001.parquet";
+    type Change<'a> = &'a dyn Fn(&Path);
+    let restarted: Change = &|root| {
+        replace(&root.join(list), vec![("dataset_from_index", integers([0, 5]))]);
+        let rows = (0..11).collect::<Vec<_>>();
+        let episodes = [vec![0; 5], vec![1; 6]].concat();
+        let columns = vec![("index", integers(rows)), ("episode_index", integers(episodes))];
+        replace(&data_file(root, 1), columns);
+    };
+    let statistics: Change = &|root| {
+        let stale = super::parquet_file::lists(integers([7, 7]), 1);
+        replace(&root.join(list), vec![("stats/episode_index/min", stale)]);
+    };
+    let late: Change = &|root| {
+        let times = [5, 6].iter().flat_map(|&n| (0..n).map(|t| t as f32 / 20.0 + 0.004));
+        let times = arrow_array::Float32Array::from_iter_values(times);
+        replace(&data_file(root, 1), vec![("timestamp", std::sync::Arc::new(times))]);
+    };
+    let none: Change = &|root| std::fs::remove_file(root.join("meta/stats.json")).unwrap();
+    for (name, change) in
+        [("restarted", restarted), ("statistics", statistics), ("late", late), ("none", none)]
+    {
+        let (_folder, root) = place();
+        three_files(&root);
+        change(&root);
+        let report = check(&root).unwrap();
+        assert_eq!((kinds(&report), report.whole), (vec![FaultKind::Stale], 5), "{name}: {report:?}");
+        assert_holds(&root, 5);
+        let report = repair(&root).unwrap();
+        assert!(report.is_sound() && !report.repairs.is_empty(), "{name}: {report:?}");
+        assert_holds(&root, 5);
+        let index = |e| Dataset::open(&root).unwrap().read(e).unwrap().i64("index").unwrap().to_vec();
+        assert_eq!((index(2), index(3)), ((7..12).collect(), (12..18).collect()), "{name}");
+        let (_folder, other) = place();
+        three_files(&other);
+        let stats = |root: &Path| std::fs::read(root.join("meta/stats.json")).unwrap();
+        assert!(stats(&root) == stats(&other), "{name}");
+        // It goes on as if nothing had been.
+        let mut writer = Writer::append(&root).unwrap();
+        writer.push_episode(&numbered(5)).unwrap();
+        writer.finish().unwrap();
+        assert_holds(&root, 6);
+    }
+}
+
+/// Every file below a folder with its bytes.
+fn bytes_of(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = vec![];
+    for path in crate::atomic::names(folder).unwrap() {
+        if path.is_dir() {
+            found.extend(bytes_of(&path));
+        } else {
+            found.push((path.clone(), std::fs::read(&path).unwrap()));
+        }
+    }
+    found
+}
+
+#[test]
+fn where_something_is_not_supported_nothing_is_touched_and_the_rest_is_read() {
+    let (_folder, root) = place();
+    three_files(&root);
+    let path = root.join("meta/info.json");
+    let text = std::fs::read_to_string(&path).unwrap();
+    std::fs::write(&path, text.replacen("\"bool\"", "\"language\"", 1)).unwrap();
+    // Damage beside it is found, and left alone too.
+    std::fs::write(data_file(&root, 2), b"").unwrap();
+    let before = bytes_of(&root);
+    let report = repair(&root).unwrap();
+    assert_eq!((kinds(&report), report.whole), (vec![FaultKind::Damage, FaultKind::Unsupported], 4));
+    assert!(report.repairs.is_empty() && bytes_of(&root) == before);
+    let dataset = Dataset::open(&root).unwrap();
+    assert_eq!(dataset.read(0).unwrap().f32("action").unwrap(), numbered(0).action.concat());
+    let error = dataset.read_columns(0, &["next.success"]).unwrap_err();
+    assert!(error.is_unsupported() && error.to_string().contains("feature `next.success`"), "{error}");
+    assert!(Writer::append(&root).unwrap_err().to_string().contains("next.success"));
+}
+
+/// What a link leads to may be another's.
+#[cfg(unix)]
+#[test]
+fn a_repair_changes_nothing_through_a_symbolic_link() {
+    let (folder, root) = place();
+    three_files(&root);
+    let other = folder.path().join("other");
+    std::fs::rename(root.join("data/chunk-000"), &other).unwrap();
+    std::os::unix::fs::symlink(&other, root.join("data/chunk-000")).unwrap();
+    assert_holds(&root, 5);
+    std::fs::write(other.join("file-002.parquet"), b"").unwrap();
+    let before = bytes_of(&other);
+    let message = repair(&root).unwrap_err().to_string();
+    assert!(message.contains("chunk-000: repair") && message.contains("a symbolic link"), "{message}");
+    assert_eq!(bytes_of(&other), before);
+    assert_eq!(Dataset::open(&root).unwrap().len(), 5);
+}
+
+#[cfg(unix)]
+#[test]
+fn pipes_and_devices_in_a_dataset_are_refused_and_not_read() {
+    for file in FILES {
+        let (_folder, root) = place();
+        three_files(&root);
+        std::fs::remove_file(root.join(file)).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", root.join(file)).unwrap();
+        let report = check(&root).unwrap();
+        assert!(
+            !report.is_sound() && report.faults[0].message.contains("a regular file"),
+            "{file}: {report:?}"
+        );
+    }
+}
+
+/// 70 rows that pyarrow packed with zstd.
+#[test]
+fn rows_that_are_packed_with_zstd_are_read() {
+    use super::parquet_file::ParquetFile;
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/lerobot/packed/zstd.parquet");
+    let file = ParquetFile::open(&path).unwrap();
+    let (time, count) = (Feature::scalar(Dtype::Float32), Feature::scalar(Dtype::Int64));
+    let state = Feature { shape: vec![8], ..Feature::scalar(Dtype::Float32) };
+    let wanted = [("timestamp", &time), ("frame_index", &count), ("observation.state", &state)];
+    let columns = file.read(&wanted, 0..70).unwrap();
+    let rows: Vec<i64> = (0..50).chain(0..20).collect();
+    assert_eq!(columns[1].1, Column::I64(rows.clone()));
+    assert_eq!(columns[0].1, Column::F32(rows.iter().map(|&t| (t as f64 / 20.0) as f32).collect()));
+    assert_eq!(columns[2].1.len(), 70 * 8);
+    assert!(columns[2].1.numbers().unwrap().iter().all(|v| v.is_finite()));
+    assert_eq!(file.read(&wanted[1..2], 60..65).unwrap()[0].1, Column::I64((10..15).collect()));
+
+    let (_folder, root) = place();
+    std::fs::create_dir_all(&root).unwrap();
+    let bytes = std::fs::read(&path).unwrap();
+    for at in (4..bytes.len() - 8).step_by(61) {
+        let mut bad = bytes.clone();
+        bad[at] ^= 0x55;
+        std::fs::write(root.join("x"), bad).unwrap();
+        let _ = ParquetFile::open(&root.join("x")).and_then(|f| f.read(&wanted, 0..70));
+    }
+}
+
+/// A dataset of two episodes of 20 rows at 20 Hz, with a video of 50 ms a frame.
+fn with_video(root: &Path) -> PathBuf {
+    let own = vec![("x".to_owned(), Feature::scalar(Dtype::Float32))];
+    let mut writer = Writer::create(root, 20.0, None, own).unwrap();
+    for _ in 0..2 {
+        let columns = vec![("x".to_owned(), Column::F32(vec![1.0; 20]))];
+        writer.push(&Table { rows: 20, columns }, "t").unwrap();
+    }
+    writer.finish().unwrap();
+    let seconds = |v: [f64; 2]| -> arrow_array::ArrayRef {
+        std::sync::Arc::new(arrow_array::Float64Array::from(v.to_vec()))
+    };
+    let columns = vec![
+        ("videos/top/chunk_index", integers([0, 0])),
+        ("videos/top/file_index", integers([0, 0])),
+        ("videos/top/from_timestamp", seconds([0.0, 1.0])),
+        ("videos/top/to_timestamp", seconds([1.0, 2.0])),
+    ];
+    replace(&root.join("meta/episodes/chunk-000/file-000.parquet"), columns);
+    let mut info = super::dataset::read_info(root).unwrap();
+    info.video_path = Some("videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4".to_owned());
+    info.features.push(("top".to_owned(), Feature { dtype: Dtype::Video, ..Feature::image(4, 4) }));
+    super::writer::write_json(&root.join("meta/info.json"), &info).unwrap();
+    let path = root.join("videos/top/chunk-000/file-000.mp4");
+    crate::write_atomic(&path, &super::mp4::tests::file(&[50; 40])).unwrap();
+    path
+}
+
+#[test]
+fn videos_are_looked_into() {
+    let (_folder, root) = place();
+    let path = with_video(&root);
+    assert_eq!(check(&root).unwrap().faults, []);
+    let whole = std::fs::read(&path).unwrap();
+    for (file, expected, left) in [
+        (super::mp4::tests::file(&[50; 39]), "frame 20 of 20 from 1 s", 1),
+        (super::mp4::tests::file(&[54; 40]), "within half a frame of", 0),
+        (whole[..whole.len() / 2].to_vec(), "cut off in `mdat`", 0),
+        (vec![], "without tables", 0),
+    ] {
+        std::fs::write(&path, file).unwrap();
+        let report = check(&root).unwrap();
+        let message = &report.faults[0].message;
+        assert_eq!((kinds(&report), report.whole), (vec![FaultKind::Damage], left), "{report:?}");
+        assert!(message.contains(expected), "{message}");
+        let read = Dataset::open(&root).unwrap().read_columns(1, &["top"]).unwrap_err().to_string();
+        assert!(read.contains("file-000.mp4: video"), "{read}");
+    }
+    std::fs::write(&path, super::mp4::tests::file(&[50; 39])).unwrap();
+    let report = repair(&root).unwrap();
+    assert!(report.is_sound() && report.whole == 1, "{report:?}");
+
+    // Times of rows that drift by more than half a frame would show the wrong frames.
+    let (_folder, root) = place();
+    with_video(&root);
+    let times = (0..40).map(|t| (t % 20) as f32 * 0.053);
+    let times = arrow_array::Float32Array::from_iter_values(times);
+    replace(&data_file(&root, 0), vec![("timestamp", std::sync::Arc::new(times))]);
+    let read = Dataset::open(&root).unwrap().read_columns(0, &["top"]).unwrap_err().to_string();
+    assert!(read.contains("column `timestamp`, row 9: expected within half a frame"), "{read}");
+    assert_eq!(kinds(&check(&root).unwrap()), [FaultKind::Damage]);
 }
 
 /// A Parquet file of nothing but a footer whose schema promises more columns than there is memory for.
@@ -665,7 +895,10 @@ fn what_files_say_does_not_break_a_message() {
         assert!(!message.contains(char::is_control) && message.contains("info.json"), "{message:?}");
         message
     };
-    refusal("\"bool\"", "\"b\\no\\u001b[31mol\"");
+    std::fs::write(root.join("meta/info.json"), text.replacen("\"bool\"", "\"b\\no\\u001b[31mol\"", 1))
+        .unwrap();
+    let message = Dataset::open(&root).unwrap().read_columns(0, &["next.success"]).unwrap_err().to_string();
+    assert!(!message.contains(char::is_control) && message.contains("info.json"), "{message:?}");
     assert!(refusal("\"action\"", "\"act\\nion\"").contains("control characters"));
     assert!(refusal("data/chunk", "data/\\nchunk").contains("data_path"));
     let long = refusal("\"v3.0\"", &format!("\"{}\"", "x".repeat(1 << 20)));

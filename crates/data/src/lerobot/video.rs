@@ -26,13 +26,15 @@ pub(crate) fn read(
     fps: f64,
     feature: &Feature,
 ) -> Result<Vec<Vec<u8>>> {
-    let [height, width, _] = feature.shape[..] else { return Ok(vec![]) };
-    if !path.is_file() {
-        return Err(file_error(path, "video", "a file", "none"));
-    }
+    let Some((height, width)) = feature.image_size() else { return Ok(vec![]) };
     // Half a frame early, so that rounding of times does not skip the first frame.
     let start = (from - 0.5 / fps).max(0.0);
     let program = std::env::var_os(PROGRAM).filter(|p| !p.is_empty()).unwrap_or_else(|| "ffmpeg".into());
+    let failed = |found: String| Error::Video {
+        path: path.to_owned(),
+        needs: "the program `ffmpeg`, 5.1 or newer (or the one that E2H_FFMPEG names), to decode it",
+        found,
+    };
     let mut command = Command::new(&program);
     command.args(["-v", "error", "-nostdin", "-ss", &format!("{start:.6}")]);
     // As MP4, which is what LeRobot writes: left to itself ffmpeg goes by the content, and what it takes for a playlist may name
@@ -40,11 +42,6 @@ pub(crate) fn read(
     command.args(["-protocol_whitelist", "file", "-f", "mp4", "-i"]).arg(prefixed("file:", path));
     command.args(["-frames:v", &count.to_string(), "-fps_mode", "passthrough"]);
     command.args(["-f", "rawvideo", "-pix_fmt", "rgb24", "pipe:1"]);
-    let failed = |found: String| Error::Video {
-        path: path.to_owned(),
-        needs: "the program `ffmpeg` (or the one that E2H_FFMPEG names) to decode it",
-        found,
-    };
     // To a file: a pipe that nobody reads would fill up and stop the decoder.
     let mut said = tempfile::tempfile().map_err(|e| failed(e.to_string()))?;
     let stderr = said.try_clone().map_err(|e| failed(e.to_string()))?;
@@ -67,7 +64,12 @@ pub(crate) fn read(
     }
     let mut text = vec![];
     let _ = said.rewind().and_then(|()| said.take(1000).read_to_end(&mut text));
-    let found = format!("{} ({status} {})", frames.len(), String::from_utf8_lossy(&text).trim());
+    let text = String::from_utf8_lossy(&text);
+    // What versions before 5.1 say of an option that they do not know.
+    if text.contains("fps_mode") {
+        return Err(failed(format!("an older one: {}", text.trim())));
+    }
+    let found = format!("{} ({status} {})", frames.len(), text.trim());
     Err(file_error(
         path,
         &format!("video from {from} s"),

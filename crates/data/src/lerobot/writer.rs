@@ -7,7 +7,7 @@ use super::table::{Column, Table, column_error};
 use super::tasks;
 use crate::Result;
 use crate::atomic::{self, UNFINISHED, io};
-use crate::file::file_error;
+use crate::file::{file_error, unsupported};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -96,7 +96,7 @@ impl Writer {
         let root = dataset.root().to_owned();
         let mut this = Self::at(root, dataset.info().clone())?;
         this.tasks = dataset.tasks().to_vec();
-        this.total = total_stats(&this.root, &this.info, dataset.episodes())?;
+        this.total = total_stats(&this.root, &this.info.features, dataset.len())?;
         if let Some(last) = dataset.episodes().last() {
             this.next = this.info.next_file(last.file);
             this.next_list = this.info.next_file(last.listed_in);
@@ -108,6 +108,10 @@ impl Writer {
     fn at(root: PathBuf, info: Info) -> Result<Self> {
         if let Some((name, _)) = info.features.iter().find(|(_, f)| f.dtype == Dtype::Video) {
             return Err(column_error(name, "images: videos are read, not written", "video"));
+        }
+        if let Some(skipped) = info.skipped.first() {
+            let what = format!("feature `{}`", skipped.name);
+            return Err(unsupported(&info_path(&root), &what, &skipped.expected, &skipped.found));
         }
         let own = info.own_features();
         Ok(Self {
@@ -244,15 +248,15 @@ impl Writer {
 }
 
 /// Statistics over all counted episodes, from those of each: `stats.json` may be ahead where a commit was cut off.
-pub(crate) fn total_stats(root: &Path, info: &Info, spans: &[EpisodeSpan]) -> Result<Stats> {
+pub(crate) fn total_stats(root: &Path, features: &Features, episodes: usize) -> Result<Stats> {
     let mut total = vec![];
-    let mut left = spans.len();
+    let mut left = episodes;
     for path in episodes::files(&episodes::folder(root))? {
         if left == 0 {
             break;
         }
         let rows = super::parquet_file::ParquetFile::open(&path)?.rows().min(left);
-        for stats in episodes::read_stats(&path, &info.features, rows)? {
+        for stats in episodes::read_stats(&path, features, rows)? {
             stats::add(&mut total, &stats);
         }
         left -= rows;

@@ -5,7 +5,7 @@ use super::recording::{Account, Camera, Pictures, Recording, Series, kind_name, 
 use super::{Listed, Options};
 use crate::directory::io;
 use crate::{Error, Result};
-use e2h_core::{Kind, Outcome};
+use e2h_core::{Kind, Outcome, one_line};
 use e2h_data::lerobot::{Column, ColumnSlice, DEFAULT_FEATURES, Dataset, Feature, Table};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -59,7 +59,7 @@ impl DatasetSource {
         let table = self.dataset.read_columns(index, &names)?;
         let mut recording = Recording {
             name: self.listed[index].name.clone(),
-            tasks: self.dataset.episodes()[index].tasks.clone(),
+            tasks: short(&self.dataset.episodes()[index].tasks),
             rows: table.rows,
             hz: info.fps,
             ..Recording::default()
@@ -173,8 +173,7 @@ impl DatasetSource {
 
     fn cameras(&self, index: usize, recording: &mut Recording) {
         for (name, feature) in &self.dataset.info().features {
-            let ([height, width, _], true) = (&feature.shape[..], feature.is_visual()) else { continue };
-            let (height, width) = (*height, *width);
+            let Some((height, width)) = feature.image_size() else { continue };
             // A video without its decoder is no reason to show nothing at all.
             match self.dataset.read_columns(index, &[name.as_str()]).map(|t| t.columns) {
                 Ok(mut columns) => {
@@ -201,11 +200,7 @@ impl DatasetSource {
             ("rate".to_owned(), format!("{} Hz", info.fps)),
         ];
         let tasks = self.dataset.tasks();
-        let mut text = tasks.iter().take(5).cloned().collect::<Vec<_>>().join("; ");
-        if tasks.len() > 5 {
-            text += &format!("; and {} more", tasks.len() - 5);
-        }
-        facts.push(("tasks".to_owned(), text));
+        facts.push(("tasks".to_owned(), short(tasks).join("; ")));
         for (name, feature) in info.own_features() {
             let dtype = format!("{:?}", feature.dtype).to_lowercase();
             facts.push((name, format!("{dtype}, {}", shape(&feature))));
@@ -301,6 +296,15 @@ fn found(dataset: &Dataset) -> Option<Position> {
     None
 }
 
+/// The first texts, each cut to what a message may have: a page of a hundred episodes says each of them a hundred times.
+fn short(texts: &[String]) -> Vec<String> {
+    let mut short: Vec<String> = texts.iter().take(5).map(|t| one_line(t)).collect();
+    if texts.len() > 5 {
+        short.push(format!("and {} more", texts.len() - 5));
+    }
+    short
+}
+
 /// Reads the report's table by the names of its columns; nothing where there is none.
 fn accounts(path: &Path) -> Result<BTreeMap<i64, Account>> {
     let text = match std::fs::read_to_string(path) {
@@ -340,4 +344,18 @@ fn accounts(path: &Path) -> Result<BTreeMap<i64, Account>> {
         }
     }
     Ok(accounts)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::short;
+
+    #[test]
+    fn texts_are_cut_to_what_a_page_has_room_for() {
+        let long = vec!["x".repeat(5 << 20); 100];
+        let short = short(&long);
+        assert_eq!(short.len(), 6);
+        assert!(short.concat().len() < 6000 && short[5] == "and 95 more", "{}", short[5]);
+        assert_eq!(super::short(&["put it on".to_owned()]), ["put it on"]);
+    }
 }

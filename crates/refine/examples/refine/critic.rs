@@ -218,7 +218,7 @@ fn rollout(
 /// The images of an episode's rows in the critic's size.
 fn frames(episode: &Episode, recording: &Table, source: &Source<'_>, size: usize) -> Result<Vec<Frames>> {
     let camera = |(name, feature): &(String, Feature)| {
-        let [height, width, _] = feature.shape[..] else { bail!("{name}: expected an image") };
+        let Some((height, width)) = feature.image_size() else { bail!("{name}: expected an image") };
         let files = recording.png(name)?;
         let mut data = Vec::with_capacity(episode.len() * size * size * 3);
         for &row in &episode.source {

@@ -77,6 +77,9 @@ struct Arguments {
     /// Override a value of the filters, for example kinematic.static_frames=8 (may be repeated).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Leave out episodes that cannot be read or hold a number that is not finite, and say which, instead of stopping.
+    #[arg(long)]
+    skip_broken: bool,
     /// Episodes whose filter picture is part of the report.
     #[arg(long, default_value_t = 12)]
     pictures: usize,
@@ -107,8 +110,13 @@ fn program() -> Result<()> {
     ensure!(a.fps.is_finite() && a.fps > 0.0, "--fps: expected a positive rate, Hz, got {}", a.fps);
     ensure!(!dataset.is_empty(), "{}: expected episodes, found none", a.dataset.display());
     if !config.reference_given {
-        let table = dataset.read_columns(0, &columns.names())?;
-        config.reverse.reference_quaternion = columns.first_orientation(&table, dataset.info())?;
+        let first = |i: usize| -> Result<[f64; 4]> {
+            let table = dataset.read_columns(i, &columns.names())?;
+            Ok(columns.first_orientation(&table, dataset.info())?)
+        };
+        let tried = if a.skip_broken { dataset.len() } else { 1 };
+        let found = (0..tried).find_map(|i| first(i).ok());
+        config.reverse.reference_quaternion = found.map_or_else(|| first(0), Ok)?;
     }
 
     let source = critic::Source { columns: &columns, cameras: &cameras };
@@ -120,9 +128,14 @@ fn program() -> Result<()> {
     );
 
     // Poses alone first: they are small, and the critic's threshold is one of all episodes.
-    let mut plans = (0..dataset.len())
-        .map(|i| plan(&dataset, &columns, &config, a.fps, i))
-        .collect::<Result<Vec<_>>>()?;
+    let mut plans = vec![];
+    for i in 0..dataset.len() {
+        match plan(&dataset, &columns, &config, &a, i) {
+            Ok(plan) => plans.push(plan),
+            Err(e) if a.skip_broken => eprintln!("left out episode {i}: {e:#}"),
+            Err(e) => return Err(e),
+        }
+    }
     ensure!(
         plans.iter().any(|p| p.refined.is_some()),
         "no episode was accepted: {}",
@@ -215,16 +228,32 @@ fn plan(
     dataset: &Dataset,
     columns: &RobotColumns,
     config: &Config,
-    fps: f64,
+    a: &Arguments,
     episode: usize,
 ) -> Result<Plan> {
-    let info = dataset.info();
+    let (info, fps) = (dataset.info(), a.fps);
     let mut names = columns.names();
+    for slice in &a.state {
+        slice.width(info)?;
+        if !names.contains(&slice.column.as_str()) {
+            names.push(&slice.column);
+        }
+    }
     let judged = info.feature("next.success").is_some_and(|f| f.dtype == Dtype::Bool);
-    if judged {
+    if judged && !names.contains(&"next.success") {
         names.push("next.success");
     }
     let table = dataset.read_columns(episode, &names)?;
+    // What is taken over as it is is looked at too, before any row is written.
+    for slice in &a.state {
+        for (row, values) in slice.read(&table, info)?.iter().enumerate() {
+            let finite = values.iter().all(|v| v.is_finite());
+            ensure!(
+                finite,
+                "episode {episode}, `{slice}`, row {row}: expected finite numbers, found {values:?}"
+            );
+        }
+    }
     let span = &dataset.episodes()[episode];
     let task = span.tasks.first().map_or("", String::as_str);
     let index = u32::try_from(episode).context("episode index")?;
@@ -260,7 +289,7 @@ fn features(a: &Arguments, info: &Info, cameras: &[(String, Feature)]) -> Result
     }
     let mut features = vec![("observation.state".to_owned(), Feature::vector(&names))];
     for (name, feature) in cameras {
-        let [height, width, _] = feature.shape[..] else { bail!("{name}: expected an image") };
+        let Some((height, width)) = feature.image_size() else { bail!("{name}: expected an image") };
         features.push((name.clone(), Feature::image(height, width)));
     }
     features.push(("action".to_owned(), Feature::vector(&ACTION_NAMES)));

@@ -1,5 +1,5 @@
 use crate::graph;
-use crate::kernel::{act, scratch};
+use crate::kernel::act;
 use crate::tape::{Flow, Node, Step, Tape, Values, run};
 use crate::{Error, Result};
 use candle_core::{Device, Tensor};
@@ -172,15 +172,14 @@ pub(crate) fn concat(tape: &mut Tape, parts: &[Node]) -> Result<Node> {
         return Ok(tape.put(Tensor::cat(&parts?, shape.len())?));
     }
     let (rows, width) = (shape.iter().product::<usize>(), widths.iter().sum::<usize>());
-    let mut y = scratch(rows * width);
-    let mut at = 0;
-    for (n, w) in parts.iter().zip(&widths) {
-        let x = tape.read(*n)?;
-        for (y, x) in y.chunks_exact_mut(width).zip(x.chunks_exact(*w)) {
-            y[at..at + w].copy_from_slice(x);
+    let read: Vec<_> = parts.iter().map(|n| tape.read(*n)).collect::<Result<_>>()?;
+    let mut y = Vec::with_capacity(rows * width);
+    for row in 0..rows {
+        for (x, w) in read.iter().zip(&widths) {
+            y.extend_from_slice(&x[row * w..][..*w]);
         }
-        at += w;
     }
+    drop(read);
     shape.push(width);
     let step = Concat { parts: parts.iter().copied().zip(widths).collect(), width };
     Ok(tape.push(y, shape, parts, &[], step))

@@ -1,5 +1,5 @@
 use crate::{Error, Result};
-use e2h_nn::{AdamConfig, EmaConfig, LrSchedule};
+use e2h_nn::{AdamConfig, EmaConfig, LrSchedule, RgbEncoderConfig};
 use serde::{Deserialize, Serialize};
 
 /// What the network is asked for.
@@ -21,6 +21,17 @@ pub enum SamplerKind {
     Ddim,
     /// Steps that add noise of their own (the default of LeRobot).
     Ddpm,
+}
+
+/// What follows the convolutions of the image encoder.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EncoderNorm {
+    /// Group norm in groups of 16 channels.
+    #[default]
+    Group,
+    /// Nothing: a batch norm was folded into them. For acting with policies from elsewhere, not for training.
+    Folded,
 }
 
 /// Mean and standard deviation that the channels of one camera's images are brought from, in [0, 1].
@@ -94,6 +105,9 @@ pub struct PolicyConfig {
     /// Scaling of the images, one entry a camera; none leaves them in [0, 1].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub image_scaling: Vec<ImageScaling>,
+    /// What follows the convolutions of the image encoder.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub encoder_norm: EncoderNorm,
 }
 
 /// An object that rolled off the table would otherwise drive a network to where no data ever were.
@@ -167,6 +181,7 @@ impl PolicyConfig {
             state_limit: STATE_LIMIT,
             unit_quaternion: true,
             image_scaling: vec![],
+            encoder_norm: EncoderNorm::Group,
         }
     }
 
@@ -185,6 +200,18 @@ impl PolicyConfig {
     /// The same for states of `state` numbers.
     pub(crate) fn condition_width(&self, state: usize) -> usize {
         self.n_obs_steps * state + self.n_image_steps * self.cameras.len() * self.image_features
+    }
+
+    /// Sizes of an encoder for crops of `rows` by `columns`.
+    pub(crate) fn encoder(&self, rows: usize, columns: usize) -> RgbEncoderConfig {
+        RgbEncoderConfig {
+            height: rows,
+            width: columns,
+            base_width: self.encoder_width,
+            stage_blocks: self.encoder_blocks.clone(),
+            keypoints: self.keypoints,
+            feature_dim: self.image_features,
+        }
     }
 
     /// Checks that the parts fit together.

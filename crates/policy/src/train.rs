@@ -1,7 +1,7 @@
 //! Training of a diffusion policy, one step at a time, exactly resumable.
 
 use crate::batch::{Host, Rows};
-use crate::{Ddim, DiffusionModel, Error, PolicyConfig, Prediction, Result, TrainConfig};
+use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Episode, Rng, stream};
 use e2h_data::{Alignment, Normaliser, Sampler, Set, Window, WindowConfig, Windows};
@@ -93,6 +93,12 @@ impl Trainer {
                 "conditions and noises: expected at least 1, got {} and {}",
                 train.conditions, train.noises
             )));
+        }
+        if config.encoder_norm == EncoderNorm::Folded {
+            return Err(Error::Config(
+                "encoder_norm: expected group, got folded: without its batch norm the encoder is for acting only"
+                    .to_owned(),
+            ));
         }
         if !(train.keypoint_sharpness.is_finite() && train.keypoint_sharpness > 0.0) {
             return Err(Error::Config(format!(

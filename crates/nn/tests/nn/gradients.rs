@@ -345,6 +345,10 @@ fn whole_networks() {
     let build = |b: &Builder<'_>| RgbEncoder::new(&config, b);
     // Rectifiers bend: the smaller eps, the fewer of the thousands of kinks it crosses.
     check("encoder", &[input(1, &[2, 21, 18, 3], 0.5, 0.5)], 1e-4, 0.1, build, |n, x| n.forward(&x[0]));
+    let build = |b: &Builder<'_>| RgbEncoder::folded(&config, b);
+    check("folded encoder", &[input(1, &[2, 21, 18, 3], 0.5, 0.5)], 1e-4, 0.1, build, |n, x| {
+        n.forward(&x[0])
+    });
     let build = |b: &Builder<'_>| Mlp::new(&[5, 9, 8, 2], 0.3, b);
     check("mlp", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| n.forward(&x[0], None::<&mut ChaCha8Rng>));
     check("mlp with dropout", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| {

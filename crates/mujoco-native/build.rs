@@ -46,10 +46,8 @@ fn provide() -> Result<PathBuf, String> {
     let library = Library::pinned(&variable("CARGO_CFG_TARGET_OS")?, &variable("CARGO_CFG_TARGET_ARCH")?)?;
     let out = out_dir("lib")?;
     let file = out.join(library.file);
-    if !file.is_file() {
-        let bytes = obtain::obtain(&library, &Settings::from_environment(out_dir("work")?))?;
-        obtain::write_whole(&file, &bytes)?;
-    }
+    obtain::install(&library, &Settings::from_environment(out_dir("work")?), &file)?;
+    println!("cargo::rerun-if-changed={}", file.display());
     symlink(Path::new(library.file), &out.join("libmujoco.so"))?;
     Ok(out)
 }

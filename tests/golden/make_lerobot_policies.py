@@ -3,7 +3,8 @@
     python make_lerobot_policies.py OUT_DIR
 
 `state` is small and complete. `image` lacks `model.safetensors` (a ResNet-18 has 45 MB): its parameters are filled by the
-formula of README.md, and so are those of `state` before they are saved; `shapes.json` has their names. `expected.safetensors` has the noise of every draw
+formula of README.md, and so are those of `state` before they are saved; `shapes.json` has their names. `batch` is
+the same with batch norms, whose buffers are stated at `fill_buffers`. `expected.safetensors` has the noise of every draw
 and the actions in the units of the dataset; observations follow from formulas, stated at `observations`.
 """
 import json
@@ -48,6 +49,14 @@ def fill(module):
             p.copy_(torch.tensor(v.astype(np.float32).reshape(tuple(p.shape))))
 
 
+def fill_buffers(module):
+    """Means and variances of batch norms, numbered k = 6000, 6001, ... by name: 0.2 s(k) and 1 + 0.5 s(k)."""
+    buffers = sorted((e for e in module.named_buffers() if ".running_" in e[0]), key=lambda e: e[0].encode())
+    for k, (name, b) in enumerate(buffers):
+        v = s(6000 + k, b.numel())
+        b.copy_(torch.tensor((0.2 * v if name.endswith("mean") else 1 + 0.5 * v).astype(np.float32)))
+
+
 def feature(kind, *shape):
     return PolicyFeature(type=kind, shape=shape)
 
@@ -70,6 +79,7 @@ def observations(config, step):
 def make(root, config, stats):
     policy = DiffusionPolicy(config).eval()
     fill(policy.diffusion)
+    fill_buffers(policy.diffusion)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     policy.save_pretrained(root)
     before.save_pretrained(root)
@@ -135,11 +145,25 @@ make(out / "image", config, {
     "observation.images.front": {"mean": imagenet["mean"] * 0.9, "std": imagenet["std"] * 1.1},
     "action": {"min": torch.tensor([-0.3, 0.1, -2.0]), "max": torch.tensor([0.4, 0.7, 3.0])},
 })
+# Batch norm, the default of LeRobot 0.6, and one encoder.
+config = DiffusionConfig(
+    input_features={"observation.state": feature(FeatureType.STATE, 2),
+                    "observation.images.top": feature(FeatureType.VISUAL, 3, 48, 61)},
+    output_features={"action": feature(FeatureType.ACTION, 2)}, down_dims=(16, 32), kernel_size=3,
+    crop_shape=(44, 60), spatial_softmax_num_keypoints=8, use_group_norm=False,
+    noise_scheduler_type="DDIM", num_inference_steps=4, **common,
+)
+make(out / "batch", config, {
+    "observation.state": {"min": -1.5 + tensor(5006, 2).abs(), "max": 1 + tensor(5007, 2).abs()},
+    "observation.images.top": imagenet,
+    "action": {"min": torch.tensor([-0.3, -2.0]), "max": torch.tensor([0.4, 3.0])},
+})
 from safetensors import safe_open  # noqa: E402
 
-with safe_open(out / "image" / "model.safetensors", "pt") as file:
-    shapes = {name: file.get_slice(name).get_shape() for name in sorted(file.keys())}
-(out / "image" / "shapes.json").write_text(json.dumps(shapes, indent=0, separators=(",", ":")) + "\n")
-(out / "image" / "model.safetensors").unlink()
-for folder in ("state", "image"):
+for folder in ("image", "batch"):
+    with safe_open(out / folder / "model.safetensors", "pt") as file:
+        shapes = {name: file.get_slice(name).get_shape() for name in sorted(file.keys())}
+    (out / folder / "shapes.json").write_text(json.dumps(shapes, indent=0, separators=(",", ":")) + "\n")
+    (out / folder / "model.safetensors").unlink()
+for folder in ("state", "image", "batch"):
     shutil.rmtree(out / folder / ".cache", ignore_errors=True)

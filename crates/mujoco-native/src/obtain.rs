@@ -160,6 +160,21 @@ pub(crate) fn obtain(library: &Library, settings: &Settings) -> Result<Vec<u8>, 
     Ok(bytes)
 }
 
+/// Sees to it that `path`, in the build's output folder, is the library: a file that is there is verified like the cached
+/// one, and replaced where it is damaged.
+///
+/// The file gets a modification time of its own, older than any build, so that cargo asks again when it changes.
+pub(crate) fn install(library: &Library, settings: &Settings, path: &Path) -> Result<(), String> {
+    if read_cached(library, path).is_err() {
+        write_cached(path, &obtain(library, settings)?)?;
+    }
+    let dated = fs::File::options().write(true).open(path).and_then(|f| f.set_modified(DATED));
+    dated.map_err(|e| format!("{}: {e}", path.display()))
+}
+
+/// Modification time of an installed library.
+const DATED: std::time::SystemTime = std::time::UNIX_EPOCH;
+
 /// What the first good source gives, else one line a source with what was wrong.
 fn first(sources: &[Source<'_>]) -> Result<Vec<u8>, Vec<String>> {
     let mut tried = vec![];
@@ -325,6 +340,28 @@ mod tests {
             assert!(read_cached(&library, &path).is_ok());
             fs::write(&path, b"libr").unwrap();
             assert!(read_cached(&library, &path).unwrap_err().contains("expected"));
+        }
+    }
+
+    #[test]
+    fn a_damaged_library_in_the_output_folder_is_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let (source, path) = (dir.path().join("w.whl"), dir.path().join("out/libmujoco.so.3.17.0"));
+        fs::write(&source, wheel(b"library")).unwrap();
+        let library = library(b"library");
+        let with = settings(dir.path(), Some(source));
+        install(&library, &with, &path).unwrap();
+        let dated = |path: &Path| fs::metadata(path).unwrap().modified().unwrap();
+        assert_eq!((fs::read(&path).unwrap().as_slice(), dated(&path)), (&b"library"[..], DATED));
+        // Cut off, or with a flipped bit: never kept, whether it can be had again or not.
+        for damaged in [&b"libr"[..], b"librarz", b""] {
+            fs::write(&path, damaged).unwrap();
+            assert_ne!(dated(&path), DATED);
+            let nowhere = Settings { cache: None, wheel: None, ..settings(dir.path(), None) };
+            let message = install(&library, &nowhere, &path).unwrap_err();
+            assert!(message.contains("could not get"), "{message}");
+            install(&library, &with, &path).unwrap();
+            assert_eq!((fs::read(&path).unwrap().as_slice(), dated(&path)), (&b"library"[..], DATED));
         }
     }
 

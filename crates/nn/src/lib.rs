@@ -62,4 +62,4 @@ pub use optim::{Adam, AdamConfig, Ema, EmaConfig, LrSchedule, learning_rate};
 pub use params::{Builder, Mode, Params};
 pub use rgb::{RgbEncoder, RgbEncoderConfig};
 pub use unet::{ConditionalUnet1d, UnetConfig};
-pub use weights::{HostTensor, Weights, load_weights, save_weights};
+pub use weights::{HostTensor, Weights, load_weights, load_weights_without, save_weights};

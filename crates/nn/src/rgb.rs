@@ -1,4 +1,4 @@
-use crate::layers::{Act, Conv2d, Extra, GroupNorm, Linear, MaxPool2d, SpatialSoftmax, relu};
+use crate::layers::{Act, Conv2d, Extra, GroupNorm, Linear, MaxPool2d, SpatialSoftmax, add, relu};
 use crate::params::Builder;
 use crate::tape::{Node, Tape, run};
 use crate::{Error, Result};
@@ -68,55 +68,82 @@ impl RgbEncoderConfig {
     }
 }
 
+/// What follows a convolution: group norm, or nothing where a norm is folded into the convolution; then `act`.
+#[derive(Clone, Debug)]
+struct After {
+    norm: Option<GroupNorm>,
+    act: Act,
+}
+
+impl After {
+    fn new(channels: usize, act: Act, folded: bool, builder: &Builder<'_>) -> Result<Self> {
+        let norm = || GroupNorm::new(channels / GROUP, channels, act, builder);
+        Ok(Self { norm: if folded { None } else { Some(norm()?) }, act })
+    }
+
+    /// act(norm(h) + residual); `h` and the residual are not read again.
+    fn record(&self, tape: &mut Tape, h: Node, residual: Option<Node>) -> Result<Node> {
+        if let Some(norm) = &self.norm {
+            let y = norm.record(tape, h, residual.map_or(Extra::None, Extra::Before))?;
+            tape.done(h);
+            residual.into_iter().for_each(|r| tape.done(r));
+            return Ok(y);
+        }
+        let mut y = h;
+        if let Some(r) = residual {
+            y = add(tape, h, r)?;
+            tape.done(h);
+            tape.done(r);
+        }
+        if self.act == Act::Relu {
+            let z = y;
+            y = relu(tape, z)?;
+            tape.done(z);
+        }
+        Ok(y)
+    }
+}
+
 /// Two 3x3 convolutions and a residual connection.
 #[derive(Clone, Debug)]
 struct BasicBlock {
     conv1: Conv2d,
-    norm1: GroupNorm,
+    after1: After,
     conv2: Conv2d,
-    norm2: GroupNorm,
-    shortcut: Option<(Conv2d, GroupNorm)>,
-}
-
-fn norm(channels: usize, act: Act, builder: &Builder<'_>) -> Result<GroupNorm> {
-    GroupNorm::new(channels / GROUP, channels, act, builder)
+    after2: After,
+    shortcut: Option<(Conv2d, After)>,
 }
 
 impl BasicBlock {
-    fn new(from: usize, to: usize, stride: usize, b: &Builder<'_>) -> Result<Self> {
-        let conv1 = Conv2d::new((from, to), 3, stride, 1, false, &b.pp("conv1"))?;
-        let norm1 = norm(to, Act::Relu, &b.pp("bn1"))?;
-        let conv2 = Conv2d::new((to, to), 3, 1, 1, false, &b.pp("conv2"))?;
-        let norm2 = norm(to, Act::Relu, &b.pp("bn2"))?;
+    fn new(channels: (usize, usize), stride: usize, folded: bool, b: &Builder<'_>) -> Result<Self> {
+        let (from, to) = channels;
+        let conv1 = Conv2d::new((from, to), 3, stride, 1, folded, &b.pp("conv1"))?;
+        let after1 = After::new(to, Act::Relu, folded, &b.pp("bn1"))?;
+        let conv2 = Conv2d::new((to, to), 3, 1, 1, folded, &b.pp("conv2"))?;
+        let after2 = After::new(to, Act::Relu, folded, &b.pp("bn2"))?;
         let shortcut = if stride == 1 && from == to {
             None
         } else {
             let b = b.pp("downsample");
-            let conv = Conv2d::new((from, to), 1, stride, 0, false, &b.pp(0))?;
-            Some((conv, norm(to, Act::None, &b.pp(1))?))
+            let conv = Conv2d::new((from, to), 1, stride, 0, folded, &b.pp(0))?;
+            Some((conv, After::new(to, Act::None, folded, &b.pp(1))?))
         };
-        Ok(Self { conv1, norm1, conv2, norm2, shortcut })
+        Ok(Self { conv1, after1, conv2, after2, shortcut })
     }
 
     fn record(&self, tape: &mut Tape, x: Node) -> Result<Node> {
         let h = self.conv1.record(tape, x)?;
-        let a = self.norm1.record(tape, h, Extra::None)?;
-        tape.done(h);
+        let a = self.after1.record(tape, h, None)?;
         let h = self.conv2.record(tape, a)?;
         tape.done(a);
         let residual = match &self.shortcut {
             None => x,
-            Some((conv, norm)) => {
+            Some((conv, after)) => {
                 let r = conv.record(tape, x)?;
-                let n = norm.record(tape, r, Extra::None)?;
-                tape.done(r);
-                n
+                after.record(tape, r, None)?
             }
         };
-        let y = self.norm2.record(tape, h, Extra::Before(residual))?;
-        tape.done(h);
-        tape.done(residual);
-        Ok(y)
+        self.after2.record(tape, h, Some(residual))
     }
 }
 
@@ -132,7 +159,7 @@ impl BasicBlock {
 pub struct RgbEncoder {
     config: RgbEncoderConfig,
     stem: Conv2d,
-    stem_norm: GroupNorm,
+    after_stem: After,
     blocks: Vec<BasicBlock>,
     pool: SpatialSoftmax,
     out: Linear,
@@ -142,11 +169,27 @@ impl RgbEncoder {
     /// # Errors
     /// As [`RgbEncoderConfig::validate`].
     pub fn new(config: &RgbEncoderConfig, builder: &Builder<'_>) -> Result<Self> {
+        Self::with(config, false, builder)
+    }
+
+    /// The same without normalisations: every convolution has a bias. With its numbers frozen, a batch norm after a
+    /// convolution is a scale and a shift of each channel, which its weights and this bias take over.
+    ///
+    /// # Errors
+    /// As [`RgbEncoderConfig::validate`].
+    ///
+    /// # Source
+    /// Ioffe and Szegedy, "Batch Normalization", algorithm 2, line 11.
+    pub fn folded(config: &RgbEncoderConfig, builder: &Builder<'_>) -> Result<Self> {
+        Self::with(config, true, builder)
+    }
+
+    fn with(config: &RgbEncoderConfig, folded: bool, builder: &Builder<'_>) -> Result<Self> {
         config.validate()?;
         let backbone = builder.pp("backbone");
         let mut width = config.base_width;
-        let stem = Conv2d::new((3, width), 7, 2, 3, false, &backbone.pp(0))?;
-        let stem_norm = norm(width, Act::Relu, &backbone.pp(1))?;
+        let stem = Conv2d::new((3, width), 7, 2, 3, folded, &backbone.pp(0))?;
+        let after_stem = After::new(width, Act::Relu, folded, &backbone.pp(1))?;
         let mut blocks = Vec::new();
         for (stage, count) in config.stage_blocks.iter().enumerate() {
             // Indices 2 and 3 of torchvision's list are the activation and the pooling.
@@ -154,13 +197,13 @@ impl RgbEncoder {
             let to = config.base_width << stage;
             for i in 0..*count {
                 let stride = if stage > 0 && i == 0 { 2 } else { 1 };
-                blocks.push(BasicBlock::new(width, to, stride, &b.pp(i))?);
+                blocks.push(BasicBlock::new((width, to), stride, folded, &b.pp(i))?);
                 width = to;
             }
         }
         let pool = SpatialSoftmax::new(width, config.keypoints, &builder.pp("pool"))?;
         let out = Linear::new(2 * config.keypoints, config.feature_dim, &builder.pp("out"))?;
-        Ok(Self { config: config.clone(), stem, stem_norm, blocks, pool, out })
+        Ok(Self { config: config.clone(), stem, after_stem, blocks, pool, out })
     }
 
     /// The sizes it was built with.
@@ -190,8 +233,7 @@ impl RgbEncoder {
 
     fn record(&self, tape: &mut Tape, x: Node) -> Result<Node> {
         let h = self.stem.record(tape, x)?;
-        let a = self.stem_norm.record(tape, h, Extra::None)?;
-        tape.done(h);
+        let a = self.after_stem.record(tape, h, None)?;
         let mut x = MaxPool2d.record(tape, a)?;
         tape.done(a);
         for block in &self.blocks {

@@ -1,4 +1,5 @@
 use crate::{Error, Result};
+use half::{bf16, f16};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, HashMap};
 use std::io::Write;
@@ -69,12 +70,23 @@ fn printable(text: &str) -> String {
     text.replace(char::is_control, "\u{fffd}")
 }
 
-/// Reads a safetensors file of `f32` tensors, with its metadata.
+/// Reads a safetensors file, with its metadata. Numbers of 16 bits (`F16`, `BF16`) become the same numbers in `f32`.
 ///
 /// # Errors
 /// [`Error::Io`] when the file cannot be read, [`Error::File`] when it is no safetensors file or holds another number
 /// type.
 pub fn load_weights(path: impl AsRef<Path>) -> Result<(Weights, BTreeMap<String, String>)> {
+    load_weights_without(path, |_| false)
+}
+
+/// [`load_weights`] without the tensors whose names `skip` holds for, whatever they are.
+///
+/// # Errors
+/// As [`load_weights`].
+pub fn load_weights_without(
+    path: impl AsRef<Path>,
+    skip: impl Fn(&str) -> bool,
+) -> Result<(Weights, BTreeMap<String, String>)> {
     let path = path.as_ref();
     let bytes = std::fs::read(path).map_err(|source| Error::Io {
         doing: "reading",
@@ -90,15 +102,26 @@ pub fn load_weights(path: impl AsRef<Path>) -> Result<(Weights, BTreeMap<String,
     let metadata = header.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
     let mut weights = Weights::new();
     for (name, view) in SafeTensors::deserialize(&bytes).map_err(not)?.tensors() {
-        if view.dtype() != Dtype::F32 {
-            return Err(Error::File {
-                path: path.to_path_buf(),
-                expected: "tensors of type F32",
-                found: format!("`{}` of type {:?}", printable(&name), view.dtype()),
-            });
+        if skip(&name) {
+            continue;
         }
-        let data =
-            view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+        let bytes = view.data();
+        let data = match view.dtype() {
+            Dtype::F32 => {
+                bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()
+            }
+            Dtype::F16 => bytes.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect(),
+            Dtype::BF16 => {
+                bytes.chunks_exact(2).map(|b| bf16::from_le_bytes([b[0], b[1]]).to_f32()).collect()
+            }
+            other => {
+                return Err(Error::File {
+                    path: path.to_path_buf(),
+                    expected: "tensors of type F32, F16 or BF16",
+                    found: format!("`{}` of type {other:?}", printable(&name)),
+                });
+            }
+        };
         weights.insert(name, HostTensor { shape: view.shape().to_vec(), data });
     }
     Ok((weights, metadata))

@@ -155,7 +155,15 @@ pub(crate) fn write_beside(dir: &Path, name: &str, value: &impl Serialize) -> Re
 
 /// Reads weights to act with, which are numbers.
 pub(crate) fn read_weights(path: &Path) -> Result<(Weights, BTreeMap<String, String>)> {
-    let (weights, metadata) = e2h_nn::load_weights(path)?;
+    read_weights_without(path, |_| false)
+}
+
+/// [`read_weights`] without the tensors whose names `skip` holds for.
+pub(crate) fn read_weights_without(
+    path: &Path,
+    skip: impl Fn(&str) -> bool,
+) -> Result<(Weights, BTreeMap<String, String>)> {
+    let (weights, metadata) = e2h_nn::load_weights_without(path, skip)?;
     for (name, tensor) in &weights {
         if let Some(entry) = tensor.data.iter().position(|v| !v.is_finite()) {
             let problem =

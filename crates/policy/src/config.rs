@@ -24,6 +24,17 @@ pub enum SamplerKind {
     Ddpm,
 }
 
+/// What follows the convolutions of the image encoder.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EncoderNorm {
+    /// Group norm in groups of 16 channels.
+    #[default]
+    Group,
+    /// Nothing: a batch norm was folded into them. For acting with policies from elsewhere, not for training.
+    Folded,
+}
+
 /// Mean and standard deviation that the channels of one camera's images are brought from, in [0, 1].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -98,6 +109,9 @@ pub struct PolicyConfig {
     /// Adds the object's pose in the frame of the tool, position and rotation: a grasp looks the same at every yaw.
     #[serde(default, skip_serializing_if = "is_default")]
     pub tool_frame_features: bool,
+    /// What follows the convolutions of the image encoder.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub encoder_norm: EncoderNorm,
 }
 
 /// An object that rolled off the table would otherwise drive a network to where no data ever were.
@@ -175,6 +189,7 @@ impl PolicyConfig {
             unit_quaternion: true,
             image_scaling: vec![],
             tool_frame_features: false,
+            encoder_norm: EncoderNorm::Group,
         }
     }
 
@@ -196,11 +211,11 @@ impl PolicyConfig {
         self.n_obs_steps * state + self.n_image_steps * self.cameras.len() * self.image_features
     }
 
-    /// The encoder of an image.
-    pub(crate) fn encoder(&self) -> RgbEncoderConfig {
+    /// Sizes of an encoder for crops of `rows` by `columns`.
+    pub(crate) fn encoder(&self, rows: usize, columns: usize) -> RgbEncoderConfig {
         RgbEncoderConfig {
-            height: self.crop_size,
-            width: self.crop_size,
+            height: rows,
+            width: columns,
             base_width: self.encoder_width,
             stage_blocks: self.encoder_blocks.clone(),
             keypoints: self.keypoints,
@@ -331,7 +346,7 @@ impl PolicyConfig {
             check(false, e.to_string());
         }
         if !self.cameras.is_empty() {
-            if let Err(e) = self.encoder().validate() {
+            if let Err(e) = self.encoder(self.crop_size, self.crop_size).validate() {
                 check(false, e.to_string());
             }
             check(

@@ -3,7 +3,7 @@
 use crate::batch::{Host, Rows};
 use crate::config::without_zero_clip;
 use crate::model::ConditionEncoder;
-use crate::{CriticConfig, Error, PolicyConfig, Result};
+use crate::{CriticConfig, EncoderNorm, Error, PolicyConfig, Result};
 use candle_core::Tensor;
 use e2h_core::{Episode, Rng, Value, stream};
 use e2h_data::Normaliser;
@@ -67,7 +67,7 @@ impl Critic {
     }
 
     fn config(policy: &PolicyConfig, critic: &CriticConfig) -> PolicyConfig {
-        PolicyConfig { crop_size: critic.crop_size, ..policy.clone() }
+        PolicyConfig { crop_size: critic.crop_size, encoder_norm: EncoderNorm::Group, ..policy.clone() }
     }
 
     fn parts(

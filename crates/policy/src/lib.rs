@@ -36,8 +36,8 @@ mod train;
 
 pub use checkpoint::{CHECKPOINT_FORMAT, Checkpoint, Provenance};
 pub use config::{
-    CriticConfig, ImageScaling, PolicyConfig, Prediction, SamplerKind, ScheduleConfig, ScheduleKind,
-    ScheduledAdam, TrainConfig,
+    CriticConfig, EncoderNorm, ImageScaling, PolicyConfig, Prediction, SamplerKind, ScheduleConfig,
+    ScheduleKind, ScheduledAdam, TrainConfig,
 };
 pub use critic::{Critic, CriticReport, train_critic};
 pub use critic_file::{CRITIC_FORMAT, CriticProvenance};

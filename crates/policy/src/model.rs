@@ -1,6 +1,6 @@
 //! Encoders, condition and U-Net: the network behind a policy.
 
-use crate::{PolicyConfig, Result};
+use crate::{EncoderNorm, PolicyConfig, Result};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Rng};
 use e2h_nn::{Builder, Compute, ConditionalUnet1d, Mode, Params, RgbEncoder, UnetConfig, Weights};
@@ -15,16 +15,18 @@ pub(crate) struct ConditionEncoder {
 
 impl ConditionEncoder {
     pub(crate) fn new(config: &PolicyConfig, state: usize, builder: &Builder) -> e2h_nn::Result<Self> {
-        let encoder = config.encoder();
+        let encoder = config.encoder(config.crop_size, config.crop_size);
+        let make = match config.encoder_norm {
+            EncoderNorm::Group => RgbEncoder::new,
+            EncoderNorm::Folded => RgbEncoder::folded,
+        };
         let names: Vec<String> = match (config.cameras.len(), config.share_encoder) {
             (0, _) => vec![],
             (_, true) => vec!["rgb_encoder".to_owned()],
             (n, false) => (0..n).map(|i| format!("rgb_encoder.{i}")).collect(),
         };
-        let encoders = names
-            .iter()
-            .map(|name| RgbEncoder::new(&encoder, &builder.pp(name)))
-            .collect::<e2h_nn::Result<_>>()?;
+        let encoders =
+            names.iter().map(|name| make(&encoder, &builder.pp(name))).collect::<e2h_nn::Result<_>>()?;
         Ok(Self { encoders, config: config.clone(), state })
     }
 

@@ -1,7 +1,7 @@
 //! Training of a diffusion policy, one step at a time, exactly resumable.
 
 use crate::batch::{Host, Rows};
-use crate::{Ddim, DiffusionModel, Error, PolicyConfig, Prediction, Result, TrainConfig};
+use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Episode, Rng, stream};
 use e2h_data::{Alignment, Normaliser, Sampler, Set, Window, WindowConfig, Windows};
@@ -109,6 +109,12 @@ impl Trainer {
         seed: u64,
         purpose: &str,
     ) -> Result<Self> {
+        if config.encoder_norm == EncoderNorm::Folded {
+            return Err(Error::Config(
+                "encoder_norm: expected group, got folded: without its batch norm the encoder is for acting only"
+                    .to_owned(),
+            ));
+        }
         let problems = train.validate();
         if !problems.is_empty() {
             return Err(Error::Config(problems.join("; ")));

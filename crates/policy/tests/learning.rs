@@ -5,8 +5,8 @@
 use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_policy::{
-    Checkpoint, CriticConfig, DiffusionPolicy, Error, PolicyConfig, Provenance, ScheduleConfig, ScheduleKind,
-    ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
+    Checkpoint, CriticConfig, DiffusionPolicy, EncoderNorm, Error, PolicyConfig, Provenance, ScheduleConfig,
+    ScheduleKind, ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::sync::Arc;
 
@@ -39,6 +39,13 @@ fn train_config() -> TrainConfig {
         schedule: ScheduleConfig { kind: ScheduleKind::Cosine, lr: 2e-3, warmup: 10 },
         ema: e2h_nn::EmaConfig::default(),
     }
+}
+
+#[test]
+fn an_encoder_without_its_norm_is_not_trained() {
+    let config = PolicyConfig { encoder_norm: EncoderNorm::Folded, ..PolicyConfig::tiny() };
+    let message = Trainer::new(&config, &train_config(), 1, None, 0, "test").err().unwrap().to_string();
+    assert!(message.contains("encoder_norm: expected group, got folded"), "{message}");
 }
 
 #[test]

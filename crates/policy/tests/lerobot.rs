@@ -5,9 +5,9 @@
 
 use e2h_core::{Direction, Episode, Image, Observation, Origin};
 use e2h_data::{Normaliser, NormaliserConfig};
-use e2h_nn::{HostTensor, Weights, load_weights, save_weights};
+use e2h_nn::{HostTensor, SpatialSoftmax, Weights, load_weights, save_weights};
 use e2h_policy::lerobot::{LerobotObservation, LerobotPolicy, export, import, obstacles};
-use e2h_policy::{DiffusionPolicy, Error, ImageScaling, PolicyConfig, Prediction, Provenance};
+use e2h_policy::{DiffusionPolicy, EncoderNorm, Error, ImageScaling, PolicyConfig, Prediction, Provenance};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -74,11 +74,7 @@ fn a_low_dimensional_policy_of_lerobots_acts_the_same_with_its_own_sampler() {
 /// before there is memory for it.
 #[test]
 fn a_network_that_no_memory_holds_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    for file in std::fs::read_dir(golden("state")).unwrap() {
-        let file = file.unwrap();
-        std::fs::copy(file.path(), folder.path().join(file.file_name())).unwrap();
-    }
+    let folder = copy("state");
     let path = folder.path().join("config.json");
     let text = std::fs::read_to_string(&path).unwrap();
     let refusal = |change: &dyn Fn(&mut Value)| {
@@ -105,17 +101,31 @@ fn a_network_that_no_memory_holds_is_refused() {
     refusal(&|v| v["type"] = "dif\nfusion".into());
 }
 
-#[test]
-fn an_image_policy_of_lerobots_acts_the_same() {
+/// A copy of a folder.
+fn copy(name: &str) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    for file in std::fs::read_dir(golden("image")).unwrap() {
+    for file in std::fs::read_dir(golden(name)).unwrap() {
         let file = file.unwrap();
         std::fs::copy(file.path(), folder.path().join(file.file_name())).unwrap();
     }
+    folder
+}
+
+/// The parameters whose shapes are stated, by the formula; buffers of batch norms have numbers of their own.
+fn filled(folder: &Path) -> Weights {
     let shapes: BTreeMap<String, Vec<usize>> =
-        serde_json::from_slice(&std::fs::read(folder.path().join("shapes.json")).unwrap()).unwrap();
+        serde_json::from_slice(&std::fs::read(folder.join("shapes.json")).unwrap()).unwrap();
     let mut weights = Weights::new();
-    for (k, (name, shape)) in shapes.iter().filter(|(n, _)| !n.ends_with("pos_grid")).enumerate() {
+    let buffers = shapes.iter().filter(|(n, _)| n.contains(".running_"));
+    for (k, (name, shape)) in buffers.enumerate() {
+        let value =
+            |i| if name.ends_with("mean") { 0.2 * s(6000 + k, i) } else { 1.0 + 0.5 * s(6000 + k, i) };
+        let data = (0..shape[0]).map(|i| value(i) as f32).collect();
+        weights.insert(name.clone(), HostTensor { shape: shape.clone(), data });
+    }
+    let parameter =
+        |n: &str| !n.ends_with("pos_grid") && !n.contains(".running_") && !n.ends_with("num_batches_tracked");
+    for (k, (name, shape)) in shapes.iter().filter(|(n, _)| parameter(n)).enumerate() {
         let fan_in: usize = shape[1..].iter().product();
         let value = |i: usize| match () {
             () if name.ends_with(".bias") => 0.05 * s(k, i),
@@ -125,6 +135,221 @@ fn an_image_policy_of_lerobots_acts_the_same() {
         let data = (0..shape.iter().product()).map(|i| value(i) as f32).collect();
         weights.insert(name.clone(), HostTensor { shape: shape.clone(), data });
     }
+    weights
+}
+
+/// A safetensors file with numbers of another type: `number` gives the bytes of each. Integers besides, as LeRobot counts
+/// batches.
+fn save_as(path: &Path, weights: &Weights, dtype: &str, number: impl Fn(f32) -> Vec<u8>) {
+    let (mut header, mut data) = (serde_json::Map::new(), vec![]);
+    let mut put = |name: &str, dtype: &str, shape: &[usize], bytes: Vec<u8>| {
+        let entry = serde_json::json!({
+            "dtype": dtype, "shape": shape, "data_offsets": [data.len(), data.len() + bytes.len()]
+        });
+        header.insert(name.to_owned(), entry);
+        data.extend(bytes);
+    };
+    for (name, t) in weights {
+        put(name, dtype, &t.shape, t.data.iter().flat_map(|v| number(*v)).collect());
+        if let Some(norm) = name.strip_suffix("running_mean") {
+            put(&format!("{norm}num_batches_tracked"), "I64", &[], 7_i64.to_le_bytes().to_vec());
+        }
+    }
+    let header = Value::Object(header).to_string();
+    let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+    bytes.extend(header.as_bytes());
+    bytes.extend(data);
+    std::fs::write(path, bytes).unwrap();
+}
+
+fn plain(v: f32) -> Vec<u8> {
+    v.to_le_bytes().to_vec()
+}
+
+/// The batch norms of LeRobot 0.6's default are folded into the convolutions, and act as they do there.
+#[test]
+fn a_policy_with_batch_norm_acts_the_same() {
+    let folder = copy("batch");
+    let file = folder.path().join("model.safetensors");
+    let mut weights = filled(folder.path());
+    save_as(&file, &weights, "F32", plain);
+    let policy = import(folder.path()).unwrap();
+    let worst = difference(&policy, &folder.path().join("expected.safetensors"));
+    assert!(worst < 1e-4, "{worst:e}");
+
+    // The means matter: others give other actions.
+    let mean = "diffusion.rgb_encoder.backbone.4.0.bn1.running_mean";
+    weights.get_mut(mean).unwrap().data.iter_mut().for_each(|v| *v += 0.5);
+    save_as(&file, &weights, "F32", plain);
+    let other = difference(&import(folder.path()).unwrap(), &folder.path().join("expected.safetensors"));
+    assert!(other > 1e-3, "{other:e}");
+
+    let refusal = |weights: &Weights| {
+        save_as(&file, weights, "F32", plain);
+        import(folder.path()).err().unwrap().to_string()
+    };
+    let mut broken = weights.clone();
+    broken.get_mut("diffusion.rgb_encoder.backbone.1.running_var").unwrap().data[3] = -0.5;
+    assert!(refusal(&broken).contains("backbone.1.running_var`: expected 0 or more, found -0.5"));
+    broken.remove("diffusion.rgb_encoder.backbone.1.running_var");
+    assert!(refusal(&broken).contains("expected `diffusion.rgb_encoder.backbone.1.running_var`, found none"));
+    broken = weights.clone();
+    broken.get_mut("diffusion.rgb_encoder.backbone.5.0.downsample.1.bias").unwrap().data.pop();
+    broken.get_mut("diffusion.rgb_encoder.backbone.5.0.downsample.1.bias").unwrap().shape = vec![127];
+    assert!(refusal(&broken).contains("downsample.1.bias`: expected shape [128], found [127]"));
+    // A norm that is not there at all.
+    broken = weights.clone();
+    broken.retain(|n, _| !n.contains("backbone.6.1.bn2."));
+    assert!(refusal(&broken).contains("diffusion.rgb_encoder.backbone.6.1.conv2.bias"));
+}
+
+/// What it cannot do is said by name.
+#[test]
+fn a_policy_with_a_folded_norm_is_not_exported() {
+    let config = PolicyConfig { encoder_norm: EncoderNorm::Folded, ..exportable() };
+    assert_eq!(
+        obstacles(&config)[0].to_string(),
+        "encoder_norm: expected group, found folded (a batch norm)"
+    );
+    let text = serde_json::to_string(&config).unwrap();
+    assert!(text.contains(r#""encoder_norm":"folded""#));
+    assert_eq!(serde_json::from_str::<PolicyConfig>(&text).unwrap(), config);
+    assert!(!serde_json::to_string(&exportable()).unwrap().contains("encoder_norm"));
+    // It is saved and loaded like any other.
+    let folder = tempfile::tempdir().unwrap();
+    let policy = DiffusionPolicy::untrained(&config, &normaliser(), 3).unwrap();
+    policy.save(folder.path(), &Provenance::default()).unwrap();
+    assert_eq!(DiffusionPolicy::load(folder.path()).unwrap().0.weights().unwrap(), policy.weights().unwrap());
+}
+
+/// Numbers of 16 bits are the same numbers in 32.
+#[test]
+fn weights_of_sixteen_bits_open() {
+    let folder = copy("state");
+    let file = folder.path().join("model.safetensors");
+    let (weights, _) = load_weights(&file).unwrap();
+    // Cut to what bf16 has, and to a multiple of 1/1024 below 2, which f16 has.
+    let brain = |v: f32| f32::from_bits(v.to_bits() & 0xffff_0000);
+    let half = |v: f32| (v * 1024.0).round().clamp(-2047.0, 2047.0) / 1024.0;
+    let half_bits = |v: f32| {
+        let bits = v.to_bits();
+        if v == 0.0 {
+            return 0;
+        }
+        let exponent = (bits >> 23 & 0xff) as u16 - 112;
+        (bits >> 16) as u16 & 0x8000 | exponent << 10 | (bits >> 13 & 0x3ff) as u16
+    };
+    let act = || {
+        let policy = import(folder.path()).unwrap();
+        let seen: Vec<LerobotObservation> = (0..2).map(|t| observation(&policy, t)).collect();
+        policy.sample(&[seen.iter().collect()], &mut |x| x.copy_from_slice(&numbers(1, x.len()))).unwrap()
+    };
+    let rounded = |round: &dyn Fn(f32) -> f32| {
+        let mut w = weights.clone();
+        w.values_mut().for_each(|t| t.data.iter_mut().for_each(|v| *v = round(*v)));
+        w
+    };
+    save_as(&file, &rounded(&brain), "F32", plain);
+    let expected = act();
+    save_as(&file, &rounded(&brain), "BF16", |v| v.to_le_bytes()[2..].to_vec());
+    assert_eq!(act(), expected);
+    save_as(&file, &rounded(&half), "F32", plain);
+    let expected = act();
+    save_as(&file, &rounded(&half), "F16", |v| half_bits(v).to_le_bytes().to_vec());
+    assert_eq!(act(), expected);
+    save_as(&file, &weights, "F64", |v| f64::from(v).to_le_bytes().to_vec());
+    let message = import(folder.path()).err().unwrap().to_string();
+    assert!(
+        message.contains("expected tensors of type F32, F16 or BF16") && message.contains("F64"),
+        "{message}"
+    );
+}
+
+/// The positions of the spatial softmax are computed here; a file with others means something else.
+#[test]
+fn positions_other_than_ours_are_refused() {
+    let folder = copy("batch");
+    let file = folder.path().join("model.safetensors");
+    let mut weights = filled(folder.path());
+    let name = "diffusion.rgb_encoder.pool.pos_grid";
+    let ours = SpatialSoftmax::position_grid(2, 2);
+    let open = |weights: &Weights| {
+        save_as(&file, weights, "F32", plain);
+        import(folder.path()).err().map(|e| e.to_string()).unwrap_or_default()
+    };
+    weights.insert(name.to_owned(), ours.clone());
+    assert_eq!(open(&weights), "");
+    // y first, from 0 to 1, and of another map.
+    let swap = |t: &HostTensor| t.data.chunks(2).flat_map(|p| [p[1], p[0]]).collect::<Vec<_>>();
+    weights.insert(name.to_owned(), HostTensor { data: swap(&ours), ..ours.clone() });
+    let message = open(&weights);
+    assert!(
+        message.contains("pos_grid: expected [4, 2], from -1 to 1 over a map of 2 x 2, found"),
+        "{message}"
+    );
+    let unit = ours.data.iter().map(|v| (v + 1.0) / 2.0).collect();
+    weights.insert(name.to_owned(), HostTensor { data: unit, ..ours.clone() });
+    assert!(open(&weights).contains("found 0 in the place of -1, entry 0"));
+    weights.insert(name.to_owned(), SpatialSoftmax::position_grid(3, 2));
+    assert!(open(&weights).contains("found [6, 2]"));
+}
+
+/// Positions that were rounded to 16 bits with the weights are those positions still.
+#[test]
+fn rounded_positions_are_taken() {
+    let folder = copy("image");
+    let at = |name: &str| folder.path().join(name);
+    let mut config = json(&at("config.json"));
+    for camera in ["wrist", "front"] {
+        config["input_features"][format!("observation.images.{camera}")]["shape"] = vec![3, 67, 130].into();
+    }
+    config["crop_shape"] = vec![64, 120].into();
+    std::fs::write(at("config.json"), config.to_string()).unwrap();
+    let mut weights = filled(folder.path());
+    let mut open = |change: &dyn Fn(f32) -> f32| {
+        for camera in 0..2 {
+            let mut grid = SpatialSoftmax::position_grid(2, 4);
+            grid.data.iter_mut().for_each(|v| *v = change(*v));
+            weights.insert(format!("diffusion.rgb_encoder.{camera}.pool.pos_grid"), grid);
+        }
+        save_weights(at("model.safetensors"), &weights, &BTreeMap::new()).unwrap();
+        import(folder.path()).err().map(|e| e.to_string()).unwrap_or_default()
+    };
+    assert_eq!(open(&|v| v), "");
+    assert_eq!(open(&|v| f32::from_bits(v.to_bits() & 0xffff_0000)), "");
+    assert_eq!(open(&|v| (v * 2048.0).round() / 2048.0), "");
+    assert!(open(&|v| v * 0.999).contains("pos_grid"));
+    assert!(open(&|v| (v * 10.0).round() / 10.0).contains("pos_grid"));
+}
+
+#[test]
+fn folders_from_before_lerobot_04_are_told_what_to_do() {
+    let folder = copy("state");
+    let at = |name: &str| folder.path().join(name);
+    std::fs::remove_file(at("policy_preprocessor.json")).unwrap();
+    let (mut weights, _) = load_weights(at("model.safetensors")).unwrap();
+    let buffer = HostTensor { shape: vec![5], data: vec![0.0; 5] };
+    weights.insert("normalize_inputs.buffer_observation_state.mean".to_owned(), buffer);
+    save_weights(at("model.safetensors"), &weights, &BTreeMap::new()).unwrap();
+    let message = import(folder.path()).err().unwrap().to_string();
+    for words in ["before 0.4", "lerobot.processor.migrate_policy_normalization", "_migrated"] {
+        assert!(message.contains(words), "expected `{words}` in: {message}");
+    }
+    // And from before a policy said its type.
+    let mut config = json(&at("config.json"));
+    config.as_object_mut().unwrap().remove("type");
+    std::fs::write(at("config.json"), config.to_string()).unwrap();
+    let message = import(folder.path()).err().unwrap().to_string();
+    assert!(
+        message.contains("expected the `type` of the policy") && message.contains("input_shapes"),
+        "{message}"
+    );
+}
+
+#[test]
+fn an_image_policy_of_lerobots_acts_the_same() {
+    let folder = copy("image");
+    let mut weights = filled(folder.path());
     let file = folder.path().join("model.safetensors");
     save_weights(&file, &weights, &BTreeMap::new()).unwrap();
     let policy = import(folder.path()).unwrap();
@@ -304,11 +529,7 @@ fn everything_that_lerobot_cannot_express_is_listed_and_nothing_is_written() {
 
 #[test]
 fn everything_of_lerobots_that_is_not_computed_here_is_listed() {
-    let folder = tempfile::tempdir().unwrap();
-    for file in std::fs::read_dir(golden("state")).unwrap() {
-        let file = file.unwrap();
-        std::fs::copy(file.path(), folder.path().join(file.file_name())).unwrap();
-    }
+    let folder = copy("state");
     let edit = |name: &str, change: &dyn Fn(&mut Value)| {
         let path = folder.path().join(name);
         let mut value = json(&golden("state").join(name));

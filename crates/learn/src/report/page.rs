@@ -182,7 +182,7 @@ fn collection_table(results: &RunResults) -> String {
             format!("{}/{}", c.hard_successes, c.cycles),
             format!("{}/{}", c.easy_successes, c.easy_rollouts),
             c.accepted.to_string(),
-            percent(c.automatic_reset_rate()),
+            automatic(c),
             resets(c),
             c.segments.to_string(),
             c.frames_kept.to_string(),
@@ -202,6 +202,18 @@ fn collection_table(results: &RunResults) -> String {
 }
 
 /// Total, then each cause with its count.
+/// The automatic-reset rate; of both kinds of cycles where there were both.
+fn automatic(c: &Collection) -> String {
+    let all = percent(c.automatic_reset_rate());
+    match (c.explored.rate(), c.plain.rate()) {
+        (Some(explored), Some(plain)) => {
+            format!("{all} ({} exploring, {} not)", percent(explored), percent(plain))
+        }
+        (Some(_), None) => format!("{all} (exploring)"),
+        _ => all,
+    }
+}
+
 fn resets(c: &Collection) -> String {
     let total: usize = c.resets.values().sum();
     let causes: Vec<String> = c

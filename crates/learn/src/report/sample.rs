@@ -1,7 +1,7 @@
 //! Made-up results for tests.
 
 use super::filter::FilterPicture;
-use crate::record::{Collection, Evaluation, IterationRecord, RunResults, wilson95};
+use crate::record::{Automatic, Collection, Evaluation, IterationRecord, RunResults, wilson95};
 use e2h_core::{Direction, Episode, Image, Observation, Origin};
 
 /// A run whose success rate climbs, with `iterations` rows.
@@ -33,6 +33,8 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
                 easy_successes: 33 + n / 2,
                 easy_rollouts: 40,
                 resets: count(&[("start", 8), ("hard_failed", 12 - n), ("easy_failed", 4), ("diverged", 1)]),
+                explored: Automatic { cycles: 30, easy_successes: 24, resets: 8 },
+                plain: Automatic { cycles: 10, easy_successes: 9, resets: 1 },
                 accepted: 29 + n / 2,
                 fates: count(&[
                     ("kept", 5200 + 90 * n),

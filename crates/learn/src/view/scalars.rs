@@ -47,6 +47,8 @@ pub(crate) fn iteration(events: &mut Events, record: &IterationRecord, wall_time
             ("refine/segments", c.segments as f64),
             ("refine/frames_kept", c.frames_kept as f64),
         ]);
+        values.extend(c.explored.rate().map(|r| ("collect/automatic_reset_rate_exploring", r)));
+        values.extend(c.plain.rate().map(|r| ("collect/automatic_reset_rate_plain", r)));
         let of: usize = c.fates.values().sum();
         values.push(("refine/kept_fraction", share(c.fates.get("kept").copied().unwrap_or(0), of)));
         values.extend(c.critic_loss.map(|l| ("critic/validation_loss", l)));

@@ -1,6 +1,6 @@
 //! Elementwise functions.
 
-use super::{each, fma, scratch, simd};
+use super::{each, fma, made, simd};
 
 const CHUNK: usize = 1 << 13;
 
@@ -87,28 +87,27 @@ fn chunk(x: &[f32], i: usize, n: usize) -> &[f32] {
 }
 
 pub(crate) fn mish_forward(x: &[f32]) -> Vec<f32> {
-    let mut y = scratch(x.len());
-    each(&mut y, CHUNK, |i, y| mish_chunk(chunk(x, i, y.len()), y));
-    y
+    made(x.len(), CHUNK, |i, y| mish_chunk(chunk(x, i, y.len()), y))
 }
 
 /// `d` holds the gradient of the result and becomes that of `x`.
 pub(crate) fn mish_backward(x: &[f32], d: &mut [f32]) {
+    debug_assert_eq!(d.len(), x.len(), "numbers of the gradient");
     each(d, CHUNK, |i, d| mish_chunk_back(chunk(x, i, d.len()), d));
 }
 
 pub(crate) fn relu_forward(x: &[f32]) -> Vec<f32> {
-    let mut y = scratch(x.len());
-    each(&mut y, CHUNK, |i, y| relu_chunk(chunk(x, i, y.len()), y));
-    y
+    made(x.len(), CHUNK, |i, y| relu_chunk(chunk(x, i, y.len()), y))
 }
 
 /// `d` holds the gradient of the result `y` and becomes that of the input.
 pub(crate) fn relu_backward(y: &[f32], d: &mut [f32]) {
+    debug_assert_eq!(d.len(), y.len(), "numbers of the gradient");
     each(d, CHUNK, |i, d| relu_chunk_back(chunk(y, i, d.len()), d));
 }
 
 pub(crate) fn mul_assign(d: &mut [f32], m: &[f32]) {
+    debug_assert_eq!(d.len(), m.len(), "numbers of the gradient");
     each(d, CHUNK, |i, d| mul_chunk(chunk(m, i, d.len()), d));
 }
 
@@ -136,21 +135,27 @@ fn film_sample_back(x: &[f32], d: &mut [f32], scale: &[f32], d_scale: &mut [f32]
 }
 }
 
+fn film_sizes(x: &[f32], e: &[f32], size: usize, c: usize) {
+    debug_assert!(c > 0 && size > 0, "samples of {size} numbers in rows of {c}");
+    debug_assert_eq!(x.len() * 2 * c, e.len() * size, "samples of x and pairs of scale and shift");
+}
+
 /// `x` of rows of `c`, `steps` rows a sample; `e` holds scale and shift of each sample.
 pub(crate) fn film_forward(x: &[f32], e: &[f32], steps: usize, c: usize) -> Vec<f32> {
-    let mut y = scratch(x.len());
     let size = steps * c;
-    each(&mut y, size, |i, y| {
+    film_sizes(x, e, size, c);
+    made(x.len(), size, |i, y| {
         let (scale, shift) = e[i * 2 * c..][..2 * c].split_at(c);
         film_sample(&x[i * size..][..size], y, scale, shift);
-    });
-    y
+    })
 }
 
 /// `d` becomes the gradient of `x`; the gradient of `e` is returned.
 pub(crate) fn film_backward(x: &[f32], e: &[f32], d: &mut [f32], steps: usize, c: usize) -> Vec<f32> {
     let mut de = vec![0.0; e.len()];
     let size = steps * c;
+    film_sizes(x, e, size, c);
+    debug_assert_eq!(d.len(), x.len(), "numbers of the gradient");
     for (i, (d, de)) in d.chunks_mut(size).zip(de.chunks_mut(2 * c)).enumerate() {
         let (d_scale, d_shift) = de.split_at_mut(c);
         film_sample_back(&x[i * size..][..size], d, &e[i * 2 * c..][..c], d_scale, d_shift);

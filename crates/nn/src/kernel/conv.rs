@@ -4,7 +4,7 @@
 //! where rows a power of two apart would fall into the same few places of the caches.
 
 use super::micro::{Isa, MAX_ROWS, Outer, Rows, Start};
-use super::{add_assign, scratch, threads};
+use super::{add_assign, made, threads};
 use rayon::prelude::*;
 use std::ptr::null;
 
@@ -65,6 +65,16 @@ impl Geo {
     fn taps(&self) -> usize {
         self.kh * self.kw
     }
+    /// The padded input covers the kernel, or taps would lie outside it; and places in a sample fit [`narrow`].
+    fn check(&self) {
+        let (h, w) = (self.h + 2 * self.ph, self.w + 2 * self.pw);
+        assert!(self.sh > 0 && self.sw > 0 && self.taps() > 0, "strides and taps of {self:?}");
+        assert!(self.kh <= h && self.kw <= w, "a kernel larger than the padded input: {self:?}");
+        assert!(
+            u32::try_from((h * w * self.c).max(self.per() * self.n)).is_ok(),
+            "too large a sample: {self:?}"
+        );
+    }
 }
 
 /// The positions of a result that sum over the same taps.
@@ -103,7 +113,7 @@ impl Class {
     }
 }
 
-#[allow(clippy::cast_possible_truncation, reason = "a sample has fewer than 2^32 numbers")]
+#[allow(clippy::cast_possible_truncation, reason = "a sample has fewer than 2^32 numbers: `Geo::check`")]
 fn narrow(x: usize) -> u32 {
     x as u32
 }
@@ -236,13 +246,12 @@ pub(crate) fn panel(n: usize) -> usize {
 pub(crate) fn in_panels(x: &[f32], n: usize, out: bool) -> Vec<f32> {
     let width = panel(n);
     let rows = x.len() / n.max(1);
-    let mut y = scratch(x.len());
-    for r in 0..rows {
-        for p in 0..n / width {
-            let (plain, paneled) = (r * n + p * width, (p * rows + r) * width);
-            let (to, from) = if out { (plain, paneled) } else { (paneled, plain) };
-            y[to..to + width].copy_from_slice(&x[from..from + width]);
-        }
+    debug_assert_eq!(x.len(), rows * n, "numbers in rows of {n}");
+    let mut y = Vec::with_capacity(x.len());
+    let (first, second) = if out { (rows, n / width) } else { (n / width, rows) };
+    for (a, b) in (0..first).flat_map(|a| (0..second).map(move |b| (a, b))) {
+        let from = if out { (b * rows + a) * width } else { b * n + a * width };
+        y.extend_from_slice(&x[from..from + width]);
     }
     y
 }
@@ -250,8 +259,8 @@ pub(crate) fn in_panels(x: &[f32], n: usize, out: bool) -> Vec<f32> {
 /// The matrices of all taps transposed, `rows` by `cols` to `cols` by `rows`, panels to panels.
 fn flip(w: &[f32], taps: usize, rows: usize, cols: usize) -> Vec<f32> {
     let (rw, cw) = (panel(rows), panel(cols));
-    let mut y = scratch(w.len());
-    super::each(&mut y, cols * rw, |i, y| {
+    debug_assert_eq!(w.len(), taps * rows * cols, "numbers of {taps} matrices {rows} by {cols}");
+    made(w.len(), cols * rw, |i, y| {
         let (r0, t) = (i / taps * rw, i % taps);
         for (p, y) in y.chunks_exact_mut(cw * rw).enumerate() {
             let block = &w[((p * taps + t) * rows + r0) * cw..][..rw * cw];
@@ -261,8 +270,30 @@ fn flip(w: &[f32], taps: usize, rows: usize, cols: usize) -> Vec<f32> {
                 }
             }
         }
-    });
-    y
+    })
+}
+
+/// Room for `n` numbers; in debug builds each is [`MARK`].
+fn room(n: usize) -> Vec<f32> {
+    let mut v = Vec::with_capacity(n);
+    if cfg!(debug_assertions) {
+        v.spare_capacity_mut()[..n].fill(std::mem::MaybeUninit::new(f32::from_bits(MARK)));
+    }
+    v
+}
+
+/// Bits of a NaN that no sum has.
+const MARK: u32 = 0x7fc0_e2e2;
+
+/// The `n` numbers of a [`room`].
+///
+/// # Safety
+/// All of them were written.
+unsafe fn written(mut v: Vec<f32>, n: usize) -> Vec<f32> {
+    // SAFETY: by the contract; `room` made the capacity.
+    unsafe { v.set_len(n) };
+    debug_assert!(v.iter().all(|v| v.to_bits() != MARK), "a number that no task wrote");
+    v
 }
 
 /// The last columns of rows of `width`, padded to `lanes`.
@@ -282,13 +313,23 @@ fn product(isa: Isa, classes: &[Class], p: &Product<'_>) -> Vec<f32> {
     let whole = width / lanes * lanes;
     let rest = width - whole;
     assert!(
-        p.w.len() >= p.taps * p.k * p.n && p.src.len() >= p.samples * p.src_size,
-        "product outside its slices"
+        p.w.len() == p.taps * p.k * p.n && p.src.len() == p.samples * p.src_size,
+        "product outside its slices: {} and {} numbers for {} taps of {} by {}, {} samples of {}",
+        p.w.len(),
+        p.src.len(),
+        p.taps,
+        p.k,
+        p.n,
+        p.samples,
+        p.src_size
     );
+    assert!(p.bias.is_none_or(|b| b.len() == p.n), "a bias of {:?} for {}", p.bias.map(<[f32]>::len), p.n);
+    let covered: usize = classes.iter().map(|c| c.to.len() * p.n).sum();
+    assert_eq!(covered, p.size, "numbers of a sample that some class computes");
     let tail = if rest > 0 { padded(p.w, width, whole, lanes) } else { Vec::new() };
     let tail_bias = p.bias.filter(|_| rest > 0).map(|b| padded(b, width, whole, lanes));
     let zero = vec![0.0; p.k];
-    let mut y = scratch(p.samples * p.size);
+    let mut y = room(p.samples * p.size);
     let place = Place(y.as_mut_ptr());
     let per_panel = width.div_ceil(2 * lanes);
     let strips = p.n / width * per_panel;
@@ -377,7 +418,8 @@ fn product(isa: Isa, classes: &[Class], p: &Product<'_>) -> Vec<f32> {
         };
         for_each(chunks * groups, rows * count * p.k * p.n, task);
     }
-    y
+    // SAFETY: the classes cover every row of every sample, once, and the strips every column of a row.
+    unsafe { written(y, p.samples * p.size) }
 }
 
 /// y = conv(x, w) + bias, with `w` of `(kh, kw, c)` by `n`.
@@ -386,6 +428,7 @@ pub(crate) fn forward(x: &[f32], w: &[f32], bias: Option<&[f32]>, g: &Geo) -> Ve
 }
 
 fn forward_with(isa: Isa, x: &[f32], w: &[f32], bias: Option<&[f32]>, g: &Geo) -> Vec<f32> {
+    g.check();
     let size = g.per() * g.n;
     let of = |src, src_size, taps, k| Product { src, src_size, size, samples: g.b, w, taps, k, n: g.n, bias };
     match merged(x, g) {
@@ -400,6 +443,7 @@ pub(crate) fn input_grad(w: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
 }
 
 fn input_grad_with(isa: Isa, w: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
+    g.check();
     let wt = flip(w, g.taps(), g.c, g.n);
     let p = Product {
         src: dy,
@@ -421,6 +465,7 @@ pub(crate) fn weight_grad(x: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
 }
 
 fn weight_grad_with(isa: Isa, x: &[f32], dy: &[f32], g: &Geo) -> Vec<f32> {
+    g.check();
     match merged(x, g) {
         Some((wide, size, class)) => outer(isa, &class, (&wide, size, g.kw * g.c), dy, g),
         None => outer(isa, &reach(g), (x, g.size(), g.c), dy, g),
@@ -438,8 +483,17 @@ fn outer(isa: Isa, class: &Class, x: (&[f32], usize, usize), dy: &[f32], g: &Geo
     let tail = if whole < width { padded(dy, n, whole, lanes) } else { Vec::new() };
     let zero = vec![0.0; c];
     let blocks = c.div_ceil(isa.rows());
-    assert!(dy.len() >= m * n && x.len() >= g.b * size, "weight gradient outside its slices");
+    assert!(
+        dy.len() == m * n && x.len() == g.b * size,
+        "weight gradient outside its slices: {} and {} numbers for {g:?}",
+        x.len(),
+        dy.len()
+    );
     let taps = class.taps.len();
+    if m == 0 {
+        // No block would write them.
+        return vec![0.0; taps * c * n];
+    }
     // Sums tap `t`, channels `channels`, over the rows of `at` into the gradient at `dw`.
     let block = |at: &[*const f32],
                  r0: usize,
@@ -494,7 +548,7 @@ fn outer(isa: Isa, class: &Class, x: (&[f32], usize, usize), dy: &[f32], g: &Geo
     };
     let work = m * taps * c * n;
     if taps * c * n >= LARGE || m <= BLOCK {
-        let mut dw = scratch(taps * c * n);
+        let mut dw = room(taps * c * n);
         let place = Place(dw.as_mut_ptr());
         for_each(taps * blocks, work, |i| {
             let (t, channels) = (i / blocks, share(c, blocks, i % blocks));
@@ -504,10 +558,11 @@ fn outer(isa: Isa, class: &Class, x: (&[f32], usize, usize), dy: &[f32], g: &Geo
                 block(&at, r0, t, channels.clone(), place.at(0), r0 > 0);
             }
         });
-        return dw;
+        // SAFETY: the first block of positions, of which there is one, writes the blocks of all channels and taps.
+        return unsafe { written(dw, taps * c * n) };
     }
     let parts = PARTS.min(m.div_ceil(BLOCK));
-    let mut sums = scratch(parts * taps * c * n);
+    let mut sums = room(parts * taps * c * n);
     let place = Place(sums.as_mut_ptr());
     for_each(parts, work, |part| {
         let rows = share(m, parts, part);
@@ -521,6 +576,8 @@ fn outer(isa: Isa, class: &Class, x: (&[f32], usize, usize), dy: &[f32], g: &Geo
             }
         }
     });
+    // SAFETY: as above; no part is without positions, for there are as many blocks at least.
+    let mut sums = unsafe { written(sums, parts * taps * c * n) };
     let more = sums.split_off(taps * c * n);
     for part in more.chunks_exact(taps * c * n) {
         add_assign(&mut sums, part);
@@ -535,6 +592,7 @@ pub(crate) fn transposed_forward(x: &[f32], w: &[f32], bias: &[f32], g: &Geo) ->
 }
 
 fn transposed_forward_with(isa: Isa, x: &[f32], w: &[f32], bias: &[f32], g: &Geo) -> Vec<f32> {
+    g.check();
     let p = Product {
         src: x,
         src_size: g.per() * g.n,
@@ -659,6 +717,48 @@ mod tests {
                 close("transposed", &g, isa, &transposed_forward_with(isa, &dy, &wt, &bias_c, &g), &up);
             }
         }
+    }
+
+    #[test]
+    fn nothing_in_gives_nothing_out_and_no_gradient() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for g in geometries().into_iter().map(|g| Geo { b: 0, ..g }) {
+            let w = in_panels(&random(g.taps() * g.c * g.n, &mut rng), g.n, false);
+            let bias = random(g.n, &mut rng);
+            for isa in Isa::all() {
+                // The allocator hands out what was just given back.
+                drop(vec![f32::NAN; w.len()]);
+                let dw = weight_grad_with(isa, &[], &[], &g);
+                assert!(dw.len() == w.len() && dw.iter().all(|v| *v == 0.0), "{g:?} {isa:?}");
+                assert!(forward_with(isa, &[], &w, Some(&bias), &g).is_empty());
+                assert!(input_grad_with(isa, &w, &[], &g).is_empty());
+            }
+        }
+    }
+
+    /// Calls that would read or write outside their slices are refused in every build.
+    #[test]
+    fn wrong_sizes_are_refused() {
+        let g = Geo { b: 2, h: 4, w: 5, c: 3, n: 20, kh: 3, kw: 3, sh: 1, sw: 1, ph: 0, pw: 0 };
+        let (x, w, bias, dy) = (vec![0.0; 120], vec![0.0; 540], vec![0.0; 20], vec![0.0; 240]);
+        let refused = |what: &str, f: &(dyn Fn() + std::panic::RefUnwindSafe)| {
+            let message = std::panic::catch_unwind(f).unwrap_err();
+            let text = message.downcast::<String>().map_or_else(|_| String::new(), |s| *s);
+            assert!(text.contains(what), "{what}: {text}");
+        };
+        drop(forward(&x, &w, Some(&bias), &g));
+        refused("bias of Some(19)", &|| drop(forward(&x, &w, Some(&bias[1..]), &g)));
+        refused("outside its slices", &|| {
+            drop(forward(&x[1..], &w, None, &Geo { c: 16, kh: 1, kw: 1, ..g }))
+        });
+        refused("outside its slices", &|| drop(forward(&x, &w[..519], None, &g)));
+        refused("outside its slices", &|| drop(weight_grad(&x, &dy[1..], &g)));
+        let small = Geo { h: 2, ..g };
+        refused("larger than the padded input", &|| drop(forward(&x[..60], &w, None, &small)));
+        refused("larger than the padded input", &|| drop(weight_grad(&x[..60], &dy, &small)));
+        refused("larger than the padded input", &|| drop(input_grad(&w, &dy, &small)));
+        refused("larger than the padded input", &|| drop(transposed_forward(&dy, &w, &bias[..3], &small)));
+        refused("too large a sample", &|| drop(forward(&x, &w, None, &Geo { h: 1 << 16, w: 1 << 16, ..g })));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Group normalisation fused with what follows it.
 
 use super::act::{mish, mish_both};
-use super::{fma, scratch, simd, worthwhile};
+use super::{Fresh, fma, simd, worthwhile};
 use rayon::prelude::*;
 
 /// Added to the variance, as in PyTorch.
@@ -43,6 +43,21 @@ impl Dims {
     fn lanes(&self) -> usize {
         let rows = (LANES / self.c.max(1)).max(1);
         if self.s.is_multiple_of(rows) { self.c * rows } else { self.c }
+    }
+    fn check(&self, maps: &[&[f32]], gamma: &[f32], beta: &[f32], extra: &[f32], post: Post) {
+        debug_assert!(self.size() > 0 && self.groups > 0 && self.c.is_multiple_of(self.groups), "{self:?}");
+        let all = self.b * self.size();
+        debug_assert!(maps.iter().all(|x| x.len() == all), "numbers of a map of {self:?}");
+        debug_assert!(
+            [gamma.len(), beta.len()] == [self.c; 2],
+            "a gain and a bias for each channel of {self:?}"
+        );
+        let expected = match post {
+            Post::AddRelu | Post::MishAdd => all,
+            Post::MishFilm => self.b * 2 * self.c,
+            Post::None | Post::Relu | Post::Mish => extra.len(),
+        };
+        debug_assert_eq!(extra.len(), expected, "the other input of {self:?}");
     }
 }
 
@@ -222,7 +237,8 @@ pub(crate) fn forward(
     post: Post,
     d: &Dims,
 ) -> (Vec<f32>, Vec<f32>) {
-    let mut y = scratch(d.b * d.size());
+    d.check(&[x], gamma, beta, extra, post);
+    let mut y = Fresh::new(d.b * d.size());
     let mut stats = vec![0.0; d.b * d.groups * 2];
     let l = d.lanes();
     let sample = |k: &mut Lanes, i: usize, y: &mut [f32], st: &mut [f32]| {
@@ -240,18 +256,18 @@ pub(crate) fn forward(
         }
         apply(x, y, &k.a, &k.b, post, e);
     };
-    if d.b > 1 && worthwhile(y.len()) {
-        y.par_chunks_mut(d.size())
+    if d.b > 1 && worthwhile(x.len()) {
+        y.par_parts(d.size())
             .zip(stats.par_chunks_mut(d.groups * 2))
             .enumerate()
             .for_each_init(|| Lanes::new(l), |k, (i, (y, st))| sample(k, i, y, st));
     } else {
         let mut k = Lanes::new(l);
-        for (i, (y, st)) in y.chunks_mut(d.size()).zip(stats.chunks_mut(d.groups * 2)).enumerate() {
+        for (i, (y, st)) in y.parts(d.size()).zip(stats.chunks_mut(d.groups * 2)).enumerate() {
             sample(&mut k, i, y, st);
         }
     }
-    (y, stats)
+    (y.done(), stats)
 }
 
 /// Gradients of gamma, beta and the other input.
@@ -273,10 +289,12 @@ pub(crate) struct Saved<'a> {
 
 /// `dy` becomes the gradient of `x`.
 pub(crate) fn backward(v: &Saved<'_>, dy: &mut [f32], post: Post, d: &Dims) -> Back {
+    d.check(&[v.x, v.y, dy], v.gamma, v.beta, v.extra, post);
+    debug_assert_eq!(v.stats.len(), d.b * d.groups * 2, "a mean and a deviation for each group of {d:?}");
     let l = d.lanes();
-    let mut parts = scratch(d.b * 4 * d.c);
+    let mut parts = vec![0.0; d.b * 4 * d.c];
     let residual = matches!(post, Post::AddRelu | Post::MishAdd);
-    let mut other = scratch(if residual { dy.len() } else { 0 });
+    let mut other = Fresh::new(if residual { dy.len() } else { 0 });
     let sample = |k: &mut Lanes, i: usize, dy: &mut [f32], part: &mut [f32], other: &mut [f32]| {
         let at = i * d.size()..(i + 1) * d.size();
         let x = &v.x[at.clone()];
@@ -294,7 +312,6 @@ pub(crate) fn backward(v: &Saved<'_>, dy: &mut [f32], post: Post, d: &Dims) -> B
             other.copy_from_slice(dy);
         }
         for (p, s) in part.chunks_exact_mut(d.c).zip(sums.chunks_exact(l)) {
-            p.fill(0.0);
             s.chunks_exact(d.c).for_each(|s| p.iter_mut().zip(s).for_each(|(p, s)| *p += s));
         }
         k.sums = sums;
@@ -317,20 +334,18 @@ pub(crate) fn backward(v: &Saved<'_>, dy: &mut [f32], post: Post, d: &Dims) -> B
         }
         second_pass(x, dy, &k.a, &k.extra, &k.b);
     };
-    let none = |o: &mut [f32]| debug_assert!(o.is_empty());
-    let (size, step) = (d.size(), if residual { d.size() } else { 1 });
+    let size = d.size();
     if d.b > 1 && worthwhile(dy.len()) {
         let main = dy.par_chunks_mut(size).zip(parts.par_chunks_mut(4 * d.c)).enumerate();
         if residual {
-            main.zip(other.par_chunks_mut(step))
+            main.zip(other.par_parts(size))
                 .for_each_init(|| Lanes::new(l), |k, ((i, (dy, p)), o)| sample(k, i, dy, p, o));
         } else {
-            none(&mut other);
             main.for_each_init(|| Lanes::new(l), |k, (i, (dy, p))| sample(k, i, dy, p, &mut []));
         }
     } else {
         let mut k = Lanes::new(l);
-        let mut others = other.chunks_mut(step);
+        let mut others = other.parts(size);
         for (i, (dy, p)) in dy.chunks_mut(size).zip(parts.chunks_mut(4 * d.c)).enumerate() {
             sample(&mut k, i, dy, p, others.next().unwrap_or_default());
         }
@@ -342,7 +357,7 @@ pub(crate) fn backward(v: &Saved<'_>, dy: &mut [f32], post: Post, d: &Dims) -> B
     let beta = total.split_off(d.c);
     let extra = match post {
         Post::MishFilm => Some(parts.chunks_exact(4 * d.c).flat_map(|p| &p[2 * d.c..]).copied().collect()),
-        Post::AddRelu | Post::MishAdd => Some(other),
+        Post::AddRelu | Post::MishAdd => Some(other.done()),
         Post::None | Post::Relu | Post::Mish => None,
     };
     Back { gamma: total, beta, extra }

@@ -67,6 +67,7 @@ fn adam_chunk(p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32], a: Adam) {
 }
 
 pub(crate) fn adam(p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32], a: Adam) {
+    debug_assert!([g.len(), m.len(), v.len()] == [p.len(); 3], "a gradient and moments for each parameter");
     if p.len() > CHUNK && threads() > 1 {
         p.par_chunks_mut(CHUNK)
             .zip(g.par_chunks(CHUNK))
@@ -88,5 +89,6 @@ fn blend_chunk(e: &mut [f32], p: &[f32], part: f32) {
 
 /// `e += part (p - e)`.
 pub(crate) fn blend(e: &mut [f32], p: &[f32], part: f32) {
+    debug_assert_eq!(e.len(), p.len(), "an average for each parameter");
     super::each(e, CHUNK, |i, e| blend_chunk(e, &p[i * CHUNK..][..e.len()], part));
 }

@@ -1,7 +1,7 @@
 //! Max pooling and the spatial softmax.
 
 use super::act::exp;
-use super::{each, fma, scratch, simd, worthwhile};
+use super::{fma, made, simd, worthwhile};
 use rayon::prelude::*;
 
 /// Window of the pooling, its step and its border.
@@ -26,6 +26,10 @@ impl Map {
     }
     fn size(&self) -> usize {
         self.h * self.w * self.c
+    }
+    fn check(&self, slices: &[&[f32]]) {
+        debug_assert!(self.size() > 0, "an empty {self:?}");
+        debug_assert!(slices.iter().all(|x| x.len() == self.b * self.size()), "numbers of a {self:?}");
     }
 }
 
@@ -55,11 +59,10 @@ fn max_sample(x: &[f32], y: &mut [f32], m: &Map) {
 }
 }
 simd! {
-/// `left` is scratch of a row: what of the gradient no position has taken yet.
+/// `dx` starts at zero. `left` is scratch of a row: what of the gradient no position has taken yet.
 fn max_sample_back(x: &[f32], y: &[f32], dy: &[f32], dx: &mut [f32], left: &mut [f32], m: &Map) {
     let _ = FMA;
     let (p, c) = (m.pooled(), m.c);
-    dx.fill(0.0);
     for (o, (y, dy)) in y.chunks_exact(c).zip(dy.chunks_exact(c)).enumerate() {
         left.copy_from_slice(dy);
         let (oy, ox) = (o / p.w, o % p.w);
@@ -79,20 +82,19 @@ fn max_sample_back(x: &[f32], y: &[f32], dy: &[f32], dx: &mut [f32], left: &mut 
 /// The largest of every 3x3 window, step 2, border 1.
 pub(crate) fn max_forward(x: &[f32], m: &Map) -> Vec<f32> {
     let size = m.pooled().size();
-    let mut y = scratch(m.b * size);
-    each(&mut y, size, |i, y| max_sample(&x[i * m.size()..][..m.size()], y, m));
-    y
+    m.check(&[x]);
+    made(m.b * size, size, |i, y| max_sample(&x[i * m.size()..][..m.size()], y, m))
 }
 
 /// The gradient of the input `x` with result `y`. Of equal maxima the first takes it.
 pub(crate) fn max_backward(x: &[f32], y: &[f32], dy: &[f32], m: &Map) -> Vec<f32> {
     let (full, size) = (m.size(), m.pooled().size());
-    let mut dx = scratch(m.b * full);
-    each(&mut dx, full, |i, dx| {
+    m.check(&[x]);
+    m.pooled().check(&[y, dy]);
+    made(m.b * full, full, |i, dx| {
         let (x, at) = (&x[i * full..][..full], i * size..(i + 1) * size);
         max_sample_back(x, &y[at.clone()], &dy[at], dx, &mut vec![0.0; m.c], m);
-    });
-    dx
+    })
 }
 
 /// -1, ..., 1 in `n` equal steps; -1 alone.
@@ -154,28 +156,23 @@ fn attend_back(a: &[f32], out: &[f32], d: &[f32], dx: &mut [f32], m: &Map) {
 
 /// `(b, h, w, c)` logits to `(b, c, 2)` expected positions, and the attention.
 pub(crate) fn keypoints_forward(logits: &[f32], m: &Map) -> (Vec<f32>, Vec<f32>) {
-    let mut a = scratch(logits.len());
-    let mut out = scratch(m.b * m.c * 2);
-    let one = |i: usize, a: &mut [f32], o: &mut [f32]| {
-        a.copy_from_slice(&logits[i * m.size()..][..m.size()]);
-        attend(a, o, m, &mut vec![0.0; 4 * m.c]);
-    };
+    m.check(&[logits]);
+    let mut a = logits.to_vec();
+    let mut out = vec![0.0; m.b * m.c * 2];
+    let one = |a: &mut [f32], o: &mut [f32]| attend(a, o, m, &mut vec![0.0; 4 * m.c]);
     if m.b > 1 && worthwhile(logits.len()) {
-        a.par_chunks_mut(m.size())
-            .zip(out.par_chunks_mut(m.c * 2))
-            .enumerate()
-            .for_each(|(i, (a, o))| one(i, a, o));
+        a.par_chunks_mut(m.size()).zip(out.par_chunks_mut(m.c * 2)).for_each(|(a, o)| one(a, o));
     } else {
-        a.chunks_mut(m.size()).zip(out.chunks_mut(m.c * 2)).enumerate().for_each(|(i, (a, o))| one(i, a, o));
+        a.chunks_mut(m.size()).zip(out.chunks_mut(m.c * 2)).for_each(|(a, o)| one(a, o));
     }
     (out, a)
 }
 
 pub(crate) fn keypoints_backward(a: &[f32], out: &[f32], d: &[f32], m: &Map) -> Vec<f32> {
-    let mut dx = scratch(a.len());
     let (size, pair) = (m.size(), m.c * 2);
-    each(&mut dx, size, |i, dx| {
+    m.check(&[a]);
+    debug_assert!([out.len(), d.len()] == [m.b * pair; 2], "pairs of a {m:?}");
+    made(a.len(), size, |i, dx| {
         attend_back(&a[i * size..][..size], &out[i * pair..][..pair], &d[i * pair..][..pair], dx, m);
-    });
-    dx
+    })
 }

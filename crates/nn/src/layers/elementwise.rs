@@ -1,5 +1,5 @@
 use crate::graph;
-use crate::kernel::{act, scratch};
+use crate::kernel::{act, add_assign};
 use crate::tape::{Flow, Node, Step, Tape, Values, run};
 use crate::{Error, Result};
 use candle_core::{Device, Tensor};
@@ -75,6 +75,35 @@ pub(crate) fn relu(tape: &mut Tape, x: Node) -> Result<Node> {
     let y = act::relu_forward(&tape.read(x)?);
     let step = ReluStep { x, y: tape.next() };
     Ok(tape.push(y, tape.shape(x).to_vec(), &[x], &[], step))
+}
+
+struct Sum([Node; 2]);
+
+impl Step for Sum {
+    fn backward(&self, values: &Values<'_>, dy: Vec<f32>, flow: &mut Flow) -> Result<()> {
+        let [a, b] = self.0;
+        if values.grad(a) {
+            flow.add(a, dy.clone());
+        }
+        if values.grad(b) {
+            flow.add(b, dy);
+        }
+        Ok(())
+    }
+}
+
+/// a + b, of one shape.
+pub(crate) fn add(tape: &mut Tape, a: Node, b: Node) -> Result<Node> {
+    if tape.shape(a) != tape.shape(b) {
+        let expected = format!("{:?}", tape.shape(a));
+        return Err(Error::Shape { what: "second summand", expected, found: tape.shape(b).to_vec() });
+    }
+    if tape.in_graph() {
+        return Ok(tape.put((tape.tensor(a)? + tape.tensor(b)?)?));
+    }
+    let mut y = tape.read(a)?.to_vec();
+    add_assign(&mut y, &tape.read(b)?);
+    Ok(tape.push(y, tape.shape(a).to_vec(), &[a, b], &[], Sum([a, b])))
 }
 
 /// Feature-wise scale and shift: `x * scale + shift`, a pair for each sample and channel.
@@ -172,15 +201,14 @@ pub(crate) fn concat(tape: &mut Tape, parts: &[Node]) -> Result<Node> {
         return Ok(tape.put(Tensor::cat(&parts?, shape.len())?));
     }
     let (rows, width) = (shape.iter().product::<usize>(), widths.iter().sum::<usize>());
-    let mut y = scratch(rows * width);
-    let mut at = 0;
-    for (n, w) in parts.iter().zip(&widths) {
-        let x = tape.read(*n)?;
-        for (y, x) in y.chunks_exact_mut(width).zip(x.chunks_exact(*w)) {
-            y[at..at + w].copy_from_slice(x);
+    let read: Vec<_> = parts.iter().map(|n| tape.read(*n)).collect::<Result<_>>()?;
+    let mut y = Vec::with_capacity(rows * width);
+    for row in 0..rows {
+        for (x, w) in read.iter().zip(&widths) {
+            y.extend_from_slice(&x[row * w..][..*w]);
         }
-        at += w;
     }
+    drop(read);
     shape.push(width);
     let step = Concat { parts: parts.iter().copied().zip(widths).collect(), width };
     Ok(tape.push(y, shape, parts, &[], step))

@@ -12,5 +12,5 @@ pub use linear::Linear;
 pub use norm::{Act, GroupNorm};
 pub use pool::{MaxPool2d, SpatialSoftmax};
 
-pub(crate) use elementwise::{concat, masked, mish, relu};
+pub(crate) use elementwise::{add, concat, masked, mish, relu};
 pub(crate) use norm::Extra;

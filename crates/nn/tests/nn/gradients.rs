@@ -170,6 +170,36 @@ fn conv1d() {
     }
 }
 
+/// A batch of nothing has no gradient, not what was in memory before.
+#[test]
+fn empty_batches() {
+    fn zero<T>(
+        what: &str,
+        shape: &[usize],
+        build: impl Fn(&Builder<'_>) -> Result<T>,
+        forward: impl Fn(&T, &Tensor) -> Result<Tensor>,
+    ) {
+        let (params, net) = filled(Mode::Train, build);
+        // The allocator hands out what was just given back.
+        drop(params.export().unwrap().values().map(|t| vec![f32::NAN; t.data.len()]).collect::<Vec<_>>());
+        let y = forward(&net, &Tensor::zeros(shape, candle_core::DType::F32, &Device::Cpu).unwrap()).unwrap();
+        assert_eq!(y.elem_count(), 0, "{what}");
+        for (name, g) in backward(&loss(&y), &params).unwrap().export(&params).unwrap() {
+            assert!(g.data.iter().all(|v| *v == 0.0), "{what}, {name}: {:?}", &g.data[..4]);
+        }
+    }
+    zero("conv1d", &[0, 16, 40], |b| Conv1d::new(40, 24, 5, 1, 2, b), |n, x| n.forward(x));
+    zero("conv2d", &[0, 6, 6, 16], |b| Conv2d::new((16, 32), 3, 2, 1, true, b), |n, x| n.forward(x));
+    zero(
+        "conv2d of colours",
+        &[0, 6, 6, 3],
+        |b| Conv2d::new((3, 16), 7, 2, 3, false, b),
+        |n, x| n.forward(x),
+    );
+    zero("transposed conv1d", &[0, 4, 8], |b| ConvTranspose1d::new(8, 6, b), |n, x| n.forward(x));
+    zero("linear", &[0, 70], |b| Linear::new(70, 90, b), |n, x| n.forward(x));
+}
+
 #[test]
 fn conv2d() {
     for (batch, size, kernel, stride, padding) in [
@@ -315,6 +345,10 @@ fn whole_networks() {
     let build = |b: &Builder<'_>| RgbEncoder::new(&config, b);
     // Rectifiers bend: the smaller eps, the fewer of the thousands of kinks it crosses.
     check("encoder", &[input(1, &[2, 21, 18, 3], 0.5, 0.5)], 1e-4, 0.1, build, |n, x| n.forward(&x[0]));
+    let build = |b: &Builder<'_>| RgbEncoder::folded(&config, b);
+    check("folded encoder", &[input(1, &[2, 21, 18, 3], 0.5, 0.5)], 1e-4, 0.1, build, |n, x| {
+        n.forward(&x[0])
+    });
     let build = |b: &Builder<'_>| Mlp::new(&[5, 9, 8, 2], 0.3, b);
     check("mlp", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| n.forward(&x[0], None::<&mut ChaCha8Rng>));
     check("mlp with dropout", &[x(1, &[3, 5])], 1e-3, 1e-2, build, |n, x| {

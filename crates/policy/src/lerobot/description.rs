@@ -1,7 +1,7 @@
 //! `config.json`, and what of a policy it can and cannot say.
 
 use super::{ACTION, IMAGES, STATE};
-use crate::{PolicyConfig, Prediction, SamplerKind};
+use crate::{EncoderNorm, PolicyConfig, Prediction, SamplerKind};
 use e2h_core::{ACTION_DIM, STATE_DIM};
 use serde::de::{MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -248,6 +248,8 @@ pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
     let known = BACKBONES.iter().any(|(_, blocks)| c.encoder_blocks == blocks);
     let names = BACKBONES.map(|(name, blocks)| format!("{blocks:?} ({name})")).join(" or ");
     ask(known, "encoder_blocks", names, format!("{:?}", c.encoder_blocks));
+    let folded = c.encoder_norm == EncoderNorm::Folded;
+    ask(!folded, "encoder_norm", "group".to_owned(), "folded (a batch norm)".to_owned());
     let features = 2 * c.keypoints;
     ask(
         c.image_features == features,

@@ -4,7 +4,7 @@ use super::description::{Description, obstacles};
 use super::{CONFIG_FILE, POSITION_GRID, processors};
 use crate::{Checkpoint, Error, PolicyConfig, Provenance, Result};
 use e2h_data::write_atomic;
-use e2h_nn::{RgbEncoderConfig, SpatialSoftmax, Weights};
+use e2h_nn::{SpatialSoftmax, Weights};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -70,15 +70,7 @@ fn json(value: &impl Serialize, path: &Path) -> Result<String> {
 
 /// LeRobot keeps the positions of the spatial softmax beside the weights.
 fn with_grids(mut weights: Weights, c: &PolicyConfig) -> Weights {
-    let encoder = RgbEncoderConfig {
-        height: c.crop_size,
-        width: c.crop_size,
-        base_width: c.encoder_width,
-        stage_blocks: c.encoder_blocks.clone(),
-        keypoints: c.keypoints,
-        feature_dim: c.image_features,
-    };
-    let (h, w) = encoder.map_size();
+    let (h, w) = c.encoder(c.crop_size, c.crop_size).map_size();
     let ends = ".pool.nets.weight";
     let encoders: Vec<String> =
         weights.keys().filter_map(|n| n.strip_suffix(ends).map(str::to_owned)).collect();

@@ -3,7 +3,7 @@
 //! [`export`] turns a checkpoint of ours into a folder that `DiffusionPolicy.from_pretrained` opens, with pre- and
 //! post-processor; [`obstacles`] says what of a configuration LeRobot cannot express. [`import`] opens such a folder, whatever
 //! the widths of its state and action are, and [`LerobotPolicy::into_policy`] makes one of ours of it where they are this
-//! project's.
+//! project's. Batch norm is folded into the convolutions: such a policy acts, and is not trained further.
 //!
 //! | file | holds |
 //! |---|---|
@@ -18,6 +18,7 @@
 
 mod description;
 mod export;
+mod fold;
 mod import;
 mod policy;
 mod processors;

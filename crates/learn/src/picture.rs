@@ -14,6 +14,7 @@ pub(crate) fn filter(episode: &Episode, refined: &Refined, config: &KinematicCon
         value: refined.value.clone(),
         advantage: refined.advantage.clone(),
         advantage_threshold: refined.threshold,
+        excursion: excursions(episode),
         dynamics_error: None,
         dynamics_threshold: None,
         static_speed: config.static_speed as f32,
@@ -22,6 +23,13 @@ pub(crate) fn filter(episode: &Episode, refined: &Refined, config: &KinematicCon
         frames: sampled_frames(episode, 0, 8),
     };
     Ok(picture.svg()?)
+}
+
+/// How far the goal of every row was displaced, mm; none where nothing displaced any.
+pub(crate) fn excursions(episode: &Episode) -> Option<Vec<f32>> {
+    let far = |[x, y, z, _]: &[f32; 4]| 1000.0 * (x * x + y * y + z * z).sqrt();
+    let all: Vec<f32> = episode.excursion.iter().map(far).collect();
+    all.iter().any(|&v| v > 0.0).then_some(all)
 }
 
 /// Films of several rollouts side by side.

@@ -125,6 +125,9 @@ pub struct Reversal {
     pub value: Option<Vec<Option<f32>>>,
     /// Smoothed advantage, likewise.
     pub advantage: Option<Vec<Option<f32>>>,
+    /// How far exploration had displaced the goal, mm; none where it had not, and in records from before there was any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub excursion: Option<Vec<f32>>,
     /// Advantage below which frames were marked for removal.
     pub threshold: Option<f32>,
 }
@@ -141,6 +144,7 @@ impl Reversal {
             source: reversed.source.clone(),
             fates: refined.fates.clone(),
             speed: refined.speed.clone(),
+            excursion: crate::picture::excursions(reversed),
             value: refined.value.as_ref().map(finite),
             advantage: refined.advantage.as_ref().map(finite),
             threshold: refined.threshold.filter(|t| t.is_finite()),

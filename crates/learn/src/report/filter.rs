@@ -29,6 +29,8 @@ pub struct FilterPicture {
     pub advantage: Option<Vec<f32>>,
     /// Frames below this advantage are dropped.
     pub advantage_threshold: Option<f32>,
+    /// How far exploration had displaced the goal, mm.
+    pub excursion: Option<Vec<f32>>,
     /// Error of the dynamics model, for the baseline that filters by it.
     pub dynamics_error: Option<Vec<f32>>,
     /// Frames above this error are dropped.
@@ -60,7 +62,7 @@ impl FilterPicture {
         fate::totals(&self.totals())
     }
 
-    /// The picture: sampled images on top, then value, advantage, dynamics error and speed over time with their
+    /// The picture: sampled images on top, then value, advantage, dynamics error, excursion and speed over time with their
     /// thresholds, all on bands that show the fates (green kept, forward hatch static, backward hatch resampled, red
     /// low advantage, grey too short), then the totals. A slow run is painted whole; the totals count its frames as they
     /// are.
@@ -79,10 +81,11 @@ impl FilterPicture {
         let slow = [(self.static_speed, "static"), (self.slow_speed, "slow")];
         let advantage: Vec<_> = self.advantage_threshold.map(|t| (t, "min")).into_iter().collect();
         let error: Vec<_> = self.dynamics_threshold.map(|t| (t, "max")).into_iter().collect();
-        let curves: [Curve; 4] = [
+        let curves: [Curve; 5] = [
             ("value", self.value.as_ref(), &[]),
             ("advantage", self.advantage.as_ref(), &advantage),
             ("dynamics error", self.dynamics_error.as_ref(), &error),
+            ("excursion, mm", self.excursion.as_ref(), &[]),
             ("speed, m/s", Some(&self.speed), &slow),
         ];
         let mut bottom = top;

@@ -165,6 +165,9 @@ impl Entries {
         let map = (map.len() == r.rows).then_some(&map[..]);
         let fates = Some(&a.fates[..]);
         let mut path = self.timeline(("speed of the whole path, m/s", &a.speed), r.hz, fates, vec![], map);
+        if let Some(excursion) = &a.excursion {
+            path += &self.timeline(("excursion of the goal, mm", excursion), r.hz, fates, vec![], map);
+        }
         if let Some(value) = &a.value {
             path += &self.timeline(("value", value), r.hz, fates, vec![], map);
         }

@@ -62,6 +62,8 @@ pub(super) struct Account {
     pub(super) speed: Vec<f64>,
     pub(super) value: Option<Vec<f64>>,
     pub(super) advantage: Option<Vec<f64>>,
+    /// How far exploration had displaced the goal, mm.
+    pub(super) excursion: Option<Vec<f64>>,
     /// Frames below this advantage were dropped.
     pub(super) threshold: Option<f64>,
 }

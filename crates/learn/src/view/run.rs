@@ -199,6 +199,7 @@ fn account(iteration: &str, r: Reversal) -> Account {
         source: r.source,
         fates: r.fates.into_iter().map(|f| crate::picture::fate_name(f).to_owned()).collect(),
         speed: wide(r.speed),
+        excursion: r.excursion.map(wide),
         value: r.value.map(gaps),
         advantage: r.advantage.map(gaps),
         threshold: r.threshold.map(f64::from),

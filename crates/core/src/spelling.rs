@@ -4,6 +4,7 @@
 /// ```
 /// assert_eq!(e2h_core::nearest("lapto", ["smoke", "laptop", "paper"]), Some("laptop"));
 /// assert_eq!(e2h_core::nearest("nut", ["nut_assembly", "disk"]), Some("nut_assembly"));
+/// assert_eq!(e2h_core::nearest("tpc", ["tcp", "joints"]), Some("tcp"));
 /// assert_eq!(e2h_core::nearest("kettle", ["nut_assembly", "disk"]), None);
 /// ```
 #[must_use]
@@ -21,20 +22,23 @@ pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) ->
     if distance <= 2 { near.or(parts) } else { parts.or(near) }.copied()
 }
 
-/// Letters to insert, delete or replace between two names.
+/// Letters to insert, delete, replace or swap with their neighbour between two names.
 fn edits(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(x != *y);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(row[j] + 1).min(diagonal + 1);
+    let (a, b): (Vec<char>, Vec<char>) = (a.chars().collect(), b.chars().collect());
+    let mut rows: Vec<Vec<usize>> = vec![(0..=b.len()).collect()];
+    for i in 1..=a.len() {
+        let mut row = vec![i];
+        for j in 1..=b.len() {
+            let replaced = rows[i - 1][j - 1] + usize::from(a[i - 1] != b[j - 1]);
+            let mut least = replaced.min(rows[i - 1][j] + 1).min(row[j - 1] + 1);
+            if i > 1 && j > 1 && a[i - 1] == b[j - 2] && a[i - 2] == b[j - 1] {
+                least = least.min(rows[i - 2][j - 2] + 1);
+            }
+            row.push(least);
         }
+        rows.push(row);
     }
-    row[b.len()]
+    rows[a.len()][b.len()]
 }
 
 /// Longest text of a file that is repeated in a message, characters.

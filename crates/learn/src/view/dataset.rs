@@ -6,7 +6,7 @@ use super::{Listed, Options};
 use crate::directory::io;
 use crate::{Error, Result};
 use e2h_core::{Kind, Outcome, one_line};
-use e2h_data::lerobot::{Column, ColumnSlice, DEFAULT_FEATURES, Dataset, Feature, Table};
+use e2h_data::lerobot::{Column, ColumnSlice, DEFAULT_FEATURES, Dataset, Feature, SOURCE_EXCURSION, Table};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -50,8 +50,10 @@ impl DatasetSource {
     /// An episode, with its pictures or without.
     pub(super) fn read(&self, index: usize, pictures: bool) -> Result<Recording> {
         let info = self.dataset.info();
-        let own =
-            |name: &str| !DEFAULT_FEATURES.iter().any(|(n, _)| *n == name) && !name.starts_with("source.");
+        let own = |name: &str| {
+            let of_all = DEFAULT_FEATURES.iter().any(|(n, _)| *n == name);
+            name == SOURCE_EXCURSION || !(of_all || name.starts_with("source."))
+        };
         let small = |f: &Feature| !f.is_visual() && f.width() <= WIDEST;
         let tool = |name: &str| self.position.as_ref().is_some_and(|p| p.column == name);
         let read = info.features.iter().filter(|(n, f)| small(f) || tool(n));
@@ -74,6 +76,9 @@ impl DatasetSource {
                 continue;
             }
             let Some(values) = table.column(name).and_then(Column::numbers) else { continue };
+            if name == SOURCE_EXCURSION && values.iter().all(|&v| v == 0.0) {
+                continue; // nothing displaced it
+            }
             if feature.width() == 1 && (name == "value" || name.ends_with(".value")) {
                 recording.value = Some(values);
             } else if feature.width() == 1 && values.iter().all(|v| Some(v) == values.first()) {

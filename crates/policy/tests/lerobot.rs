@@ -90,7 +90,7 @@ fn a_network_that_no_memory_holds_is_refused() {
     assert!(dims(&[1 << 20, 1 << 20]).contains("of another shape"));
     assert!(dims(&[1 << 40]).contains("1 to 16 sizes of 1 to 1048576"));
     assert!(dims(&[8; 70]).contains("levels of down_dims: expected 1 to 16, got 70"));
-    assert!(refusal(&|v| v["horizon"] = (1_u64 << 60).into()).contains("horizon: expected 1 to 65536"));
+    assert!(refusal(&|v| v["horizon"] = (1_u64 << 60).into()).contains("horizon: expected 1 to 4096"));
     assert!(refusal(&|v| v["num_train_timesteps"] = (1_u64 << 50).into()).contains("train_timesteps"));
     assert!(refusal(&|v| v["n_obs_steps"] = u64::MAX.into()).contains("n_obs_steps"));
     assert!(refusal(&|v| v["spatial_softmax_num_keypoints"] = u64::MAX.into()).contains("image_features"));

@@ -50,6 +50,6 @@ pub use goal::{Goal, GoalConfig};
 pub use gripper::{GateConfig, gate, gripper_switches};
 pub use kinematic::{KinematicConfig, kinematic_filter};
 pub use resample::resample;
-pub use reverse::{ReverseConfig, rebuild_actions, reverse};
+pub use reverse::{Labels, ReverseConfig, rebuild_actions, reverse};
 pub use series::{moving_average, percentile, runs};
 pub use suffix::{SuffixConfig, cut_suffix};

@@ -26,6 +26,13 @@ impl Region {
         Vector3::new(draw(rng, self.x), draw(rng, self.y), height)
     }
 
+    /// The point nearest to `p`, on the level, that is over the region or within three quarters of [`MARGIN`]: what is put
+    /// down there still counts when the hand pushes it a little as it lets go.
+    pub(crate) fn nearest(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        let nearest = |v: f64, [low, high]: [f64; 2]| v.clamp(low - 0.75 * MARGIN, high + 0.75 * MARGIN);
+        Vector3::new(nearest(p.x, self.x), nearest(p.y, self.y), p.z)
+    }
+
     /// Whether a point is over the region or within [`MARGIN`] of it.
     pub(crate) fn contains(&self, p: &Vector3<f64>) -> bool {
         let within = |v: f64, [low, high]: [f64; 2]| (low - MARGIN..=high + MARGIN).contains(&v);

@@ -1,6 +1,7 @@
 use crate::tasks::ENTRIES;
 use crate::{Error, Expert, PosturePull, Result, Sim, TaskOptions, config::DemonstratorConfig};
 use e2h_core::{Direction, Pose, Rng};
+use nalgebra::Vector3;
 use std::sync::{Arc, LazyLock};
 
 /// A pair of tasks that undo each other, in one scene.
@@ -61,6 +62,12 @@ pub trait Task: Send + Sync {
     /// an excursion as far as this. By default, for pairs without a hole: how far it is beyond 5 cm from where the episode began.
     fn room(&self, sim: &Sim) -> f64 {
         (sim.object().position - sim.object_start().position).norm() - 0.05
+    }
+
+    /// Where the object may be put down at the end of the easy task, nearest to `p` on the level, m: an excursion is held
+    /// within it as the object comes down. By default, for pairs that allow any place: `p`.
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        *p
     }
 
     /// Whether the object has to be held throughout: dropping it then ends the episode.

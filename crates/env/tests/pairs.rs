@@ -366,3 +366,18 @@ fn there_is_no_room_for_an_excursion_at_the_goal_and_some_on_the_way() {
         assert!(most > 0.03, "{}: {most} m at best", label(task));
     });
 }
+
+#[test]
+fn every_start_of_the_hard_task_is_where_the_object_may_be_put_down() {
+    each(|task, env| {
+        for k in 0..20 {
+            env.reset(Direction::Hard, &mut rng("put down", k)).unwrap();
+            let p = env.sim().object().position;
+            assert_eq!(task.put_down(&p), p, "{}", label(task));
+            for far in [Vector3::new(3.0, -2.0, 0.0), Vector3::new(-4.0, 5.0, 0.1)] {
+                let q = task.put_down(&(p + far));
+                assert_eq!((task.put_down(&q), q.z), (q, p.z + far.z), "{}", label(task));
+            }
+        }
+    });
+}

@@ -129,6 +129,8 @@ pub(crate) struct Wander {
     /// The policy's goal of the step before.
     before: Option<Vector3<f64>>,
     now: [f64; 4],
+    /// By how much the object was out of where it may be put down when it was last held, m.
+    back: [f64; 2],
 }
 
 impl Wander {
@@ -144,7 +146,15 @@ impl Wander {
                 (amplitude, low + (high - low) * rng.random::<f64>(), TAU * rng.random::<f64>())
             })
         });
-        Self { ramp: config.ramp_m, release: config.release, axes, clock: 0.0, before: None, now: [0.0; 4] }
+        Self {
+            ramp: config.ramp_m,
+            release: config.release,
+            axes,
+            clock: 0.0,
+            before: None,
+            now: [0.0; 4],
+            back: [0.0; 2],
+        }
     }
 
     /// By how much the goal of the last step was displaced.
@@ -178,9 +188,23 @@ impl Wander {
             let wave = |&(amplitude, hz, phase): &Wave| amplitude * (TAU * hz * self.clock + phase).sin();
             *now = weight * axis.iter().map(wave).sum::<f64>();
         }
-        let [x, y, z, yaw] = self.now;
-        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
-        let displaced = Pose::new(goal.position + Vector3::new(x, y, z), turn * goal.orientation);
+        let displaced = |[x, y, z, yaw]: [f64; 4]| {
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
+            Pose::new(goal.position + Vector3::new(x, y, z), turn * goal.orientation)
+        };
+        // As the object comes down it is brought to where it may lie, as it sits in the hand.
+        if sim.touching() {
+            let tcp = sim.tcp();
+            let held = tcp.orientation.inverse() * (sim.object().position - tcp.position);
+            let there = displaced(self.now);
+            let lands = there.position + there.orientation * held;
+            let back = env.task().put_down(&lands) - lands;
+            self.back = [back.x, back.y];
+        }
+        for (now, back) in self.now.iter_mut().zip(self.back) {
+            *now += free * (1.0 - height) * back;
+        }
+        let displaced = displaced(self.now);
         let mut out = *action;
         // The action's own hemisphere, so that no sign flips.
         out[..7].copy_from_slice(&displaced.to_row(&[3, 4, 5, 6].map(|i| f64::from(action[i]))));

@@ -6,8 +6,11 @@ use e2h_core::{Action, ActionChunk, Direction, Kind, Observation, Origin, Policy
 use e2h_env::{Env, EnvConfig, TaskOptions, task};
 use e2h_learn::{Collected, ExploreConfig, Progress, RunConfig, collect};
 
-/// Takes the cube in the tray and carries it to a place over the table, with no word from any network.
-struct Carry;
+/// Takes the cube in the tray and carries it to a place, with no word from any network.
+struct Carry([f32; 3]);
+
+/// Over the table, in the middle of where it may be put down.
+const OVER: Carry = Carry([0.52, -0.10, 0.20]);
 
 impl Policy for Carry {
     fn n_obs_steps(&self) -> usize {
@@ -19,8 +22,9 @@ impl Policy for Carry {
             let s = history[0].state;
             let there = (0..2).all(|i| (s[i] - s[7 + i]).abs() < 0.004) && s[2] - s[9] < 0.012;
             let closed = s[14] < 0.06;
-            let goal = if closed && s[9] > 0.045 {
-                [0.52, -0.10, 0.20]
+            let lifted = s[9] > 0.045 || (s[7] - 0.52).abs() < 0.2 && (s[8] + 0.1).abs() < 0.1;
+            let goal = if closed && lifted {
+                self.0
             } else if closed {
                 [s[0], s[1], 0.20]
             } else {
@@ -59,6 +63,10 @@ fn collected(explore: ExploreConfig, threads: usize) -> Collected {
 }
 
 fn collected_in(iteration: u32, explore: ExploreConfig, threads: usize) -> Collected {
+    collected_by(&OVER, iteration, explore, threads)
+}
+
+fn collected_by(easy: &Carry, iteration: u32, explore: ExploreConfig, threads: usize) -> Collected {
     let env = EnvConfig { cameras: false, horizon_hard: 16, horizon_easy: 150, ..EnvConfig::default() };
     let task = task("cube_pick_place", &TaskOptions::default()).unwrap();
     let mut config = RunConfig::resolve("smoke", "cube_pick_place", &[]).unwrap().config.closed_loop;
@@ -71,7 +79,7 @@ fn collected_in(iteration: u32, explore: ExploreConfig, threads: usize) -> Colle
         ..Origin::demonstration("cube_pick_place", Direction::Easy, 0, 7)
     };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    pool.install(|| collect(envs, &Still, &Carry, &config, &origin, &Progress::new(true))).unwrap()
+    pool.install(|| collect(envs, &Still, easy, &config, &origin, &Progress::new(true))).unwrap()
 }
 
 #[test]
@@ -138,4 +146,20 @@ fn every_value_changes_what_is_collected() {
 
 fn rows_of(iteration: u32, explore: &ExploreConfig) -> Vec<e2h_core::Episode> {
     collected_in(iteration, explore.clone(), 2).rejected
+}
+
+#[test]
+fn what_comes_down_is_brought_to_where_it_may_be_put_down() {
+    // 50 mm beyond the edge of the start region, and low.
+    let outside = Carry([0.62, -0.10, 0.05]);
+    let still =
+        ExploreConfig { enabled: true, sideways_m: 0.0, up_m: 0.0, yaw_rad: 0.0, ..ExploreConfig::default() };
+    let ends = |explore: &ExploreConfig| -> Vec<f32> {
+        let all = collected_by(&outside, 1, explore.clone(), 2);
+        all.rejected.iter().map(|e| e.state[e.len() - 1][7]).collect()
+    };
+    assert!(ends(&ExploreConfig::default()).iter().all(|x| (x - 0.62).abs() < 0.006));
+    // Held 24 mm over the table it is brought most of the way; at the table it would be all of it.
+    let brought = ends(&still);
+    assert!(brought.iter().all(|x| (0.58..0.605).contains(x)), "{brought:?}");
 }

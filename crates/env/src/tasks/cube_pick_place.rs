@@ -112,6 +112,10 @@ impl Task for CubePickPlace {
         }
     }
 
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        START.nearest(p)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let yaw = draw(rng, [-FRAC_PI_4, FRAC_PI_4]);
         let spread = config.waypoint_noise_m;

@@ -123,6 +123,10 @@ impl Task for CubeStack {
         }
     }
 
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        START.nearest(p)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let table = Stand::open(START.draw(rng, HALF), Turn::Hand(draw(rng, [-FRAC_PI_4, FRAC_PI_4])));
         let off = scatter(rng, 0.5 * config.waypoint_noise_m);

@@ -127,6 +127,10 @@ impl Task for CylinderPickPlace {
         (p.z - HALF - RIM).max(beside(&p, &seat()) - 2.0 * RADIUS)
     }
 
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        START.nearest(p)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let noise = config.waypoint_noise_m;
         let table = Stand::open(START.draw(rng, HALF), Turn::Keep);

@@ -133,6 +133,10 @@ impl Task for Disk {
         (p.z - HALF - ROD.1).max(beside(&p, &seat()) - RADIUS - ROD.0)
     }
 
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        START.nearest(p)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let noise = config.waypoint_noise_m;
         let table = Stand::open(START.draw(rng, HALF), Turn::Keep);

@@ -109,6 +109,10 @@ impl Task for Mouse {
         }
     }
 
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        START.nearest(p)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         let yaw = Turn::Object(draw(rng, [-START_YAW, START_YAW]));
         let table = Stand::open(START.draw(rng, HALF[2]), yaw);

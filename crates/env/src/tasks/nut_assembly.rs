@@ -145,6 +145,12 @@ impl Task for NutAssembly {
         over.max((p.xy() - Vector2::from(self.variant.peg)).norm() - self.variant.reach())
     }
 
+    fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
+        let margin = 0.75 * BOX_MARGIN;
+        let nearest = |v: f64, [low, high]: [f64; 2]| v.clamp(low - margin, high + margin);
+        Vector3::new(nearest(p.x, self.variant.start_x), nearest(p.y, self.variant.start_y), p.z)
+    }
+
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {
         Box::new(plan::script(self.variant, direction, config, rng))
     }

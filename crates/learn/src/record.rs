@@ -165,6 +165,15 @@ pub struct RunResults {
     pub seed: u64,
     /// Version of this library that made the run.
     pub version: String,
+    /// Easy demonstrations that the run began with; 0 in results of version 0.1.
+    #[serde(default)]
+    pub demonstrations: usize,
+    /// Whether easy rollouts explored.
+    #[serde(default)]
+    pub explored: bool,
+    /// What was laid over preset and task file, as `key.path=value`; with task, preset, seed and version it repeats the run.
+    #[serde(default)]
+    pub overrides: Vec<String>,
     /// Threads that ran, and the processor's name where the system tells it.
     pub machine: String,
     /// The success curve.

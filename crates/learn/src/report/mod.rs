@@ -5,6 +5,7 @@
 
 pub mod animation;
 pub mod chart;
+pub mod curve;
 pub(crate) mod fate;
 pub mod filter;
 pub mod page;
@@ -104,6 +105,14 @@ pub fn write_report(
     let path = dir.join(REPORT_FILE);
     write_atomic(&path, page::html(results, config_toml, pictures).as_bytes())?;
     Ok(path)
+}
+
+/// Writes a drawing to `path`, whole or not at all.
+///
+/// # Errors
+/// [`Error::Io`] with the path.
+pub fn write_svg(path: &Path, svg: &str) -> Result<()> {
+    write_atomic(path, svg.as_bytes())
 }
 
 /// Writes `bytes` beside `path` first and renames: whoever reads sees the old file or the new one, never a part.

@@ -2,8 +2,9 @@
 # A run is killed, its disk fails, its files are damaged, and two processes work in it at once. Whatever happens, it ends with the
 # bytes of an undisturbed run or with a refusal that names the file, and nothing is left over.
 #
-#   tests/faults/run.sh [sample | full] [SEED]      prints a table of counts; status 1 where anything else happened
+#   tests/faults/run.sh [sample | full] [SEED] [FAULT ...]      prints a table of counts; status 1 where anything else happened
 #
+# FAULT is kills, operations, damage or pairs, by default all of them. On SIGTERM it tells what it has found so far.
 # The sample takes about a minute, and damages only policies; everything takes half an hour. E2H_FAULTS_SET has further values
 # of the configuration ("loop.cycles=1 ...").
 set -euo pipefail
@@ -16,6 +17,9 @@ case "$how" in
     full) kills=200 every=10 errnos=(28 5) damaged=60 pairs=20 ;;
     *) echo "expected sample or full, got $how" >&2; exit 2 ;;
 esac
+
+wanted=" ${*:3} "
+[ $# -ge 3 ] || wanted=" kills operations damage pairs "
 
 cd "$root"
 if [ -z "${E2H_FAULTS_PROGRAM:-}" ]; then
@@ -35,7 +39,8 @@ e2h() { "$program" "${settings[@]}" --out "$1/run" "${@:2}" > "$1.out" 2>&1; }
 faulty() { env "FAULT_ROOT=$1/run" "LD_PRELOAD=$library" "${@:2}"; }
 # Goes on where a run is; where there is none yet, begins.
 again() { if [ -e "$1/run/run.json" ]; then e2h "$1" --resume; else e2h "$1"; fi; }
-drawn() { echo $(((RANDOM << 15 | RANDOM) % $1)); }
+# Sets `drawn`, below $1. A subshell would draw from a stream of its own.
+draw() { drawn=$(((RANDOM << 15 | RANDOM) % $1)); }
 
 # Every file of a run and a checksum of it, without the times that it took and the machine's name.
 clocks='/"stage_minutes": \{$/,/\}/d; s/"(minutes|seconds|machine)": [^{}]*//'
@@ -77,6 +82,21 @@ judge() {
     fi
 }
 last_words() { tail -n 1 "$1.out" | cut -c 1-200; }
+table() {
+    echo
+    echo "| fault | cases | runs with the same bytes in the end | refused, with the file's name | not noticed | refused without a name | not to be resumed | left over |"
+    echo "|---|---|---|---|---|---|---|---|"
+    for line in "kills:killed at a drawn instant, several times a run" "operations:a file operation fails, then \`--resume\`" "damage:a damaged file, then \`--resume\`" "pairs:two processes at once"; do
+        k="${line%%:*}"
+        [ "${count[$k, cases]:-0}" -gt 0 ] || continue
+        echo "| ${line#*:} | ${count[$k, cases]:-0} | ${count[$k, same]:-0} | ${count[$k, refused]:-0} | ${count[$k, unnoticed]:-0} | ${count[$k, unnamed]:-0} | ${count[$k, refusal]:-0} | ${count[$k, leftover]:-0} |"
+    done
+    if [ ${#findings[@]} -gt 0 ]; then
+        echo
+        printf -- '- %s\n' "${findings[@]}" | sed "s#$work/##g"
+    fi
+}
+
 folder() { rm -rf "$work/case" "$work/case.out"; mkdir "$work/case"; }
 case="$work/case"
 
@@ -90,30 +110,34 @@ operations="$(sed -n 's/^operations //p' "$log")"
 total="$(awk '{ print int(1000 * ($1 + $2)) }' <<< "$seconds")"
 echo "one run: $total ms of processor time, $operations file operations" >&2
 
+trap 'table; exit 1' TERM
+
 kind=kills
-done=0
+count[kills, cases]=0
 folder
-while [ "$done" -lt "$kills" ]; do
-    ms=$((20 + $(drawn "$total")))
+while [ "${count[kills, cases]}" -lt "$kills" ]; do
+    [[ "$wanted" == *" $kind "* ]] || break
+    draw "$total"
+    ms=$((20 + drawn))
     how_to=()
     [ -e "$case/run/run.json" ] && how_to=(--resume)
     status=0
     faulty "$case" "FAULT_CPU_MS=$ms" "$program" "${settings[@]}" --out "$case/run" "${how_to[@]}" > "$case.out" 2>&1 || status=$?
     case "$status" in
-        155) done=$((done + 1)) ;; # 128 + SIGPROF
+        155) count[kills, cases]=$((${count[kills, cases]} + 1)) ;; # 128 + SIGPROF
         0) ;;
-        *) done=$((done + 1)); note refusal "after a kill: $(last_words "$case")"; folder; continue ;;
+        *) count[kills, cases]=$((${count[kills, cases]} + 1)); note refusal "after a kill: $(last_words "$case")"; folder; continue ;;
     esac
     # A run that has ended, or that was the last one killed, is judged; its kills count with it.
-    if [ "$status" = 0 ] || [ "$done" -ge "$kills" ]; then
+    if [ "$status" = 0 ] || [ "${count[kills, cases]}" -ge "$kills" ]; then
         if [ "$status" = 0 ] || again "$case"; then judge "$case" "killed at $ms ms"; else note refusal "after a kill: $(last_words "$case")"; fi
         folder
     fi
 done
-count[kills, cases]="$done"
 
 kind=operations
 for errno in "${errnos[@]}"; do
+    [[ "$wanted" == *" $kind "* ]] || break
     for ((at = every; at <= operations; at += every)); do
         folder
         count[$kind, cases]=$((${count[$kind, cases]:-0} + 1))
@@ -143,6 +167,7 @@ part() {
 part middle iteration_01/{record.json,policy,rollouts.png}
 part start iteration_00 iteration_01
 for ((i = 0; i < damaged; i++)); do
+    [[ "$wanted" == *" $kind "* ]] || break
     folder
     count[$kind, cases]=$((${count[$kind, cases]:-0} + 1))
     from=(whole middle start)
@@ -151,9 +176,11 @@ for ((i = 0; i < damaged; i++)); do
     cp -r "$work/$from" "$case"
     mapfile -t files < <(cd "$case/run" && find . -type f -size +0 ! -name run.lock | sort)
     if [ "$how" = sample ]; then mapfile -t files < <(printf '%s\n' "${files[@]}" | grep 'policy.*/\(policy.json\|model\)'); fi
-    file="${files[$(drawn ${#files[@]})]}"
+    draw ${#files[@]}
+    file="${files[drawn]}"
     length="$(stat -c %s "$case/run/$file")"
-    at="$(drawn "$length")"
+    draw "$length"
+    at="$drawn"
     if [ $((i % 4)) = 3 ]; then
         truncate -s "$at" "$case/run/$file"
         what="$file of a run ($from), cut to $at of $length bytes"
@@ -165,7 +192,7 @@ for ((i = 0; i < damaged; i++)); do
     fi
     if e2h "$case" --resume; then
         judge "$case" "$what"
-    elif grep -qF "${file#./}" "$case.out" || grep -qF "$(dirname "${file#./}")" "$case.out"; then
+    elif grep -qF "run/${file#./}" "$case.out" || grep -qF "run: ${file#./}: " "$case.out" || grep -qF "run/$(dirname "${file#./}"): " "$case.out"; then
         note refused "$what"
     else
         note unnamed "$what: $(last_words "$case")"
@@ -174,12 +201,14 @@ done
 
 kind=pairs
 for ((i = 0; i < pairs; i++)); do
+    [[ "$wanted" == *" $kind "* ]] || break
     folder
     count[$kind, cases]=$((${count[$kind, cases]:-0} + 1))
     first=0 second=0
     "$program" "${settings[@]}" --out "$case/run" > "$work/first" 2>&1 &
     other=$!
-    sleep "0.$(printf %02d "$(drawn 30)")"
+    draw 30
+    sleep "0.$(printf %02d "$drawn")"
     "$program" "${settings[@]}" --out "$case/run" --resume > "$work/second" 2>&1 || second=$?
     wait "$other" || first=$?
     if [ "$first" != 0 ] && [ "$second" != 0 ]; then
@@ -195,15 +224,5 @@ for ((i = 0; i < pairs; i++)); do
     if [ -n "$unnamed" ]; then note unnamed "$unnamed"; else judge "$case" "two processes"; fi
 done
 
-echo
-echo "| fault | cases | runs with the same bytes in the end | refused, with the file's name | not noticed | refused without a name | not to be resumed | left over |"
-echo "|---|---|---|---|---|---|---|---|"
-for line in "kills:killed at a drawn instant, several times a run" "operations:a file operation fails, then \`--resume\`" "damage:a damaged file, then \`--resume\`" "pairs:two processes at once"; do
-    k="${line%%:*}"
-    echo "| ${line#*:} | ${count[$k, cases]:-0} | ${count[$k, same]:-0} | ${count[$k, refused]:-0} | ${count[$k, unnoticed]:-0} | ${count[$k, unnamed]:-0} | ${count[$k, refusal]:-0} | ${count[$k, leftover]:-0} |"
-done
-if [ ${#findings[@]} -gt 0 ]; then
-    echo
-    printf -- '- %s\n' "${findings[@]}" | sed "s#$work/##g"
-    exit 1
-fi
+table
+if [ ${#findings[@]} -gt 0 ]; then exit 1; fi

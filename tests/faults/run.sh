@@ -4,7 +4,7 @@
 #
 #   tests/faults/run.sh [sample | full] [SEED] [FAULT ...]      prints a table of counts; status 1 where anything else happened
 #
-# FAULT is kills, operations, damage or pairs, by default all of them. On SIGTERM it tells what it has found so far.
+# FAULT is kills, operations, damage or pairs, by default all of them.
 # The sample takes about a minute, and damages only policies; everything takes half an hour. E2H_FAULTS_SET has further values
 # of the configuration ("loop.cycles=1 ...").
 set -euo pipefail
@@ -109,8 +109,6 @@ contents "$work/whole" > "$work/expected"
 operations="$(sed -n 's/^operations //p' "$log")"
 total="$(awk '{ print int(1000 * ($1 + $2)) }' <<< "$seconds")"
 echo "one run: $total ms of processor time, $operations file operations" >&2
-
-trap 'table; exit 1' TERM
 
 kind=kills
 count[kills, cases]=0

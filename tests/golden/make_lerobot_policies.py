@@ -6,8 +6,10 @@
 formula of README.md, and so are those of `state` before they are saved; `shapes.json` has their names. `batch` is
 the same with batch norms, whose buffers are stated at `fill_buffers`. `expected.safetensors` has the noise of every draw
 and the actions in the units of the dataset; observations follow from formulas, stated at `observations`.
+`image` has `rounding.safetensors` instead, with actions in float64 and in float32, stated at `rounding`.
 """
 import json
+import math
 import os
 import shutil
 import sys
@@ -111,6 +113,52 @@ def make(root, config, stats):
     print(root.name, tuple(actions.shape), len(draws), "draws")
 
 
+CASES = 48
+
+
+def rounding(root):
+    """The actions of case c in the units of the dataset: "float64", to judge by, and "float32", as torch has them.
+
+    Case c has seen the steps c n_obs_steps + 0, 1, ..., and starts from the noise s(4000 + c). In float64 everything is: images
+    over 255, statistics, schedule and network; only the weights, states and noise are the float32 numbers of the files.
+    """
+    def actions(case, dtype):
+        torch.set_default_dtype(dtype)
+        policy = DiffusionPolicy.from_pretrained(root).to(dtype)
+        before, after = make_pre_post_processors(policy.config, pretrained_path=str(root))
+        config, scheduler = policy.config, policy.diffusion.noise_scheduler
+        if dtype == torch.float64:
+            n = config.num_train_timesteps
+            bar = lambda t: math.cos((t / n + 0.008) / 1.008 * math.pi / 2) ** 2
+            betas = torch.tensor([min(1 - bar(t + 1) / bar(t), 0.999) for t in range(n)])
+            table = torch.cumprod(1 - betas, 0)
+            assert (table - scheduler.alphas_cumprod).abs().max() < 1e-6
+            scheduler.alphas_cumprod = table
+            scheduler.final_alpha_cumprod = torch.tensor(1.0)
+        noise = tensor(4000 + case, 1, config.horizon, config.output_features["action"].shape[0]).to(dtype)
+        for step in range(config.n_obs_steps):
+            seen = observations(config, case * config.n_obs_steps + step)
+            for name in config.image_features:
+                seen[name] = (seen[name] * 255).round().to(dtype) / 255
+            seen = before({name: value.to(dtype) for name, value in seen.items()})
+            if step + 1 < config.n_obs_steps:
+                policy._queues["action"].extend([None])
+            action = policy.select_action(seen, noise=noise)
+        found = [after(action)]
+        while policy._queues["action"]:
+            found.append(after(policy.select_action(seen, noise=noise)))
+        torch.set_default_dtype(torch.float32)
+        assert found[0].dtype == dtype, found[0].dtype
+        return torch.cat(found)
+
+    cases = {d: torch.stack([actions(c, getattr(torch, d)) for c in range(CASES)]).double() for d in ("float64", "float32")}
+    off = (cases["float32"] - cases["float64"]).flatten(1).norm(dim=1) / cases["float64"].flatten(1).norm(dim=1)
+    (root / "expected.safetensors").unlink()
+    # Rounded once: a hundredth of what is compared.
+    save_file({name: actions.float() for name, actions in cases.items()}, root / "rounding.safetensors")
+    print(root.name, "float32 is off by", off.sort().values.tolist())
+
+
 out = Path(sys.argv[1])
 common = dict(n_obs_steps=2, horizon=8, n_action_steps=5, device="cpu", push_to_hub=False, diffusion_step_embed_dim=8)
 
@@ -145,6 +193,7 @@ make(out / "image", config, {
     "observation.images.front": {"mean": imagenet["mean"] * 0.9, "std": imagenet["std"] * 1.1},
     "action": {"min": torch.tensor([-0.3, 0.1, -2.0]), "max": torch.tensor([0.4, 0.7, 3.0])},
 })
+rounding(out / "image")
 # Batch norm, the default of LeRobot 0.6, and one encoder.
 config = DiffusionConfig(
     input_features={"observation.state": feature(FeatureType.STATE, 2),

@@ -321,6 +321,13 @@ fn what_cannot_be_read_is_told() {
 
     let root = dir.path().join("data");
     dataset(&root, 2);
+    // Of what stands beside the dataset only what a report can be: a sparse file of a gigabyte takes no place here.
+    let frames = root.join("report/frames.csv");
+    std::fs::create_dir(root.join("report")).unwrap();
+    std::fs::File::create(&frames).unwrap().set_len(1 << 30).unwrap();
+    let message = write(&root, &out, &Options::default()).unwrap_err().to_string();
+    assert!(message.contains("frames.csv") && message.contains("at most 67108864 bytes"), "{message}");
+    std::fs::remove_file(&frames).unwrap();
     let wrong = Options { position: Some("action[0:2]".parse().unwrap()), ..Options::default() };
     assert!(write(&root, &out, &wrong).unwrap_err().to_string().contains("expected 3 entries, found 2"));
 }

@@ -346,6 +346,30 @@ fn folders_from_before_lerobot_04_are_told_what_to_do() {
     );
 }
 
+/// Against float64, beside torch's float32. Sampling amplifies a rounding, in some cases a thousandfold: single cases say nothing
+/// (on the first, torch 2.7 and 2.10 are 4e-5 apart, where ours and torch are 4e-5 and 2e-5 from float64), their middle does. Its
+/// standard error over 48 cases is 12 %, by bootstrap, and three of those are granted.
+fn rounds_no_worse_than_torch(policy: &LerobotPolicy, file: &Path) {
+    let (cases, _) = load_weights(file).unwrap();
+    let per: usize = cases["float64"].shape[1..].iter().product();
+    let torch = cases["float32"].data.chunks_exact(per);
+    let mut worse = vec![];
+    for (case, (want, torch)) in cases["float64"].data.chunks_exact(per).zip(torch).enumerate() {
+        let steps = (0..policy.n_obs_steps()).map(|t| case * policy.n_obs_steps() + t);
+        let seen: Vec<LerobotObservation> = steps.map(|step| observation(policy, step)).collect();
+        let noise = &mut |x: &mut [f32]| x.copy_from_slice(&numbers(4000 + case, x.len()));
+        let ours = policy.sample(&[seen.iter().collect()], noise).unwrap().remove(0).concat();
+        assert_eq!(ours.len(), per);
+        let off = |v: &[f32]| v.iter().zip(want).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>().sqrt();
+        println!("case {case}: {:.1e} from float64, torch {:.1e}", off(&ours), off(torch));
+        worse.push(off(&ours) / off(torch));
+    }
+    worse.sort_by(f64::total_cmp);
+    let middle = worse[worse.len() / 2];
+    println!("{middle:.2} times as far as torch");
+    assert!(middle < 1.4, "{middle:.2} times as far from float64 as torch's float32");
+}
+
 #[test]
 fn an_image_policy_of_lerobots_acts_the_same() {
     let folder = copy("image");
@@ -357,8 +381,7 @@ fn an_image_policy_of_lerobots_acts_the_same() {
         policy.cameras().collect::<Vec<_>>(),
         ["observation.images.wrist", "observation.images.front"]
     );
-    let worst = difference(&policy, &folder.path().join("expected.safetensors"));
-    assert!(worst < 1e-4, "{worst:e}");
+    rounds_no_worse_than_torch(&policy, &folder.path().join("rounding.safetensors"));
 
     weights.remove("diffusion.unet.final_conv.1.bias");
     save_weights(&file, &weights, &BTreeMap::new()).unwrap();

@@ -103,10 +103,50 @@ fn broken_recordings_stop_the_work_or_are_left_out_by_name() {
         let output = refine(&from, &to, &["--skip-broken"]);
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(output.status.success() && said.contains("left out episode 0: "), "{said}");
-        let refined = Dataset::open(&to).unwrap();
-        assert_eq!((refined.len(), refined.read(0).unwrap().i64("source.episode").unwrap()[0]), (1, 1));
-        std::fs::remove_dir_all(&to).unwrap();
+        left_out_alone(&to, 0, says);
     }
+}
+
+/// Of two recordings one was left out, and the report says which, and why.
+fn left_out_alone(to: &Path, episode: i64, says: &str) {
+    let refined = Dataset::open(to).unwrap();
+    assert_eq!((refined.len(), refined.read(0).unwrap().i64("source.episode").unwrap()[0]), (1, 1 - episode));
+    let report = std::fs::read(to.join("report/report.json")).unwrap();
+    let report: serde_json::Value = serde_json::from_slice(&report).unwrap();
+    assert_eq!((&report["episodes_in"], &report["episodes_accepted"]), (&2.into(), &1.into()));
+    let broken = &report["left_out"].as_array().unwrap()[..];
+    assert_eq!((broken.len(), &broken[0]["episode"]), (1, &episode.into()));
+    assert!(broken[0]["reason"].as_str().unwrap().contains(says), "{broken:?}");
+    let page = std::fs::read_to_string(to.join("report/report.html")).unwrap();
+    assert!(page.contains("1 of 2 recordings") && page.contains(&format!("<li>episode {episode}: ")));
+    std::fs::remove_dir_all(to).unwrap();
+}
+
+/// Images are files in a column: rows may be sound and one of their images not.
+#[test]
+fn a_recording_with_an_image_that_cannot_be_decoded_is_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, from, to) =
+        (folder.path().join("whole"), folder.path().join("unplug"), folder.path().join("plug_in"));
+    record(&whole, &[true, true]);
+    // Its writer looks at images; that of another robot did not.
+    record(&from, &[true]);
+    let dataset = Dataset::open(&whole).unwrap();
+    let own = ["tcp", "jaw", "joints", "front", "next.success"];
+    let mut table = dataset.read_columns(0, &own).unwrap();
+    let images = table.columns.iter_mut().find(|(n, _)| n == "front").unwrap();
+    let Column::Png(files) = &mut images.1 else { panic!("images") };
+    // Statistics are of a part of the rows.
+    let row = 102;
+    let length = files[row].len();
+    files[row].truncate(length / 2);
+    let mut writer = Writer::append(&from).unwrap();
+    writer.push(&table, "unplug").unwrap();
+    writer.finish().unwrap();
+    let output = refine(&from, &to, &["--skip-broken"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && said.contains("left out episode 1: "), "{said}");
+    left_out_alone(&to, 1, "column `front`, row 102");
 }
 
 #[test]

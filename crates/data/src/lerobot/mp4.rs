@@ -130,7 +130,11 @@ impl Times {
             return Err(whole(format!("{length} bytes without tables: it was never finished")));
         };
         if fragments {
-            return Err(unsupported(path, "video", "an MP4 file in one piece", "fragments"));
+            return Err(fragmented(path));
+        }
+        // Fragments may be to come where there are none yet.
+        if Bytes(&tables).find(b"mvex").is_ok_and(|found| found.is_some()) {
+            return Err(fragmented(path));
         }
         times(Bytes(&tables), length).map(Self).map_err(|(other, found)| {
             if other { unsupported(path, "video", "tables of one video", found) } else { whole(found) }
@@ -163,11 +167,14 @@ impl Times {
     }
 }
 
+/// Its frames are in tables all over the file, which are not read here.
+fn fragmented(path: &Path) -> crate::Error {
+    let expected = "an MP4 file in one piece (`ffmpeg -i IN -c copy OUT` makes one)";
+    unsupported(path, "video", expected, "a fragmented one")
+}
+
 /// The first video track's times; `length` is that of the file.
 fn times(moov: Bytes, length: u64) -> std::result::Result<Vec<f64>, Wrong> {
-    if moov.find(b"mvex")?.is_some() {
-        return Err((true, "fragments".to_owned()));
-    }
     let clock = |mut header: Bytes| -> std::result::Result<f64, Wrong> {
         let skip = if header.version()? == 1 { 16 } else { 8 };
         header.take(skip)?;
@@ -327,6 +334,17 @@ pub(crate) mod tests {
         boxed(name, &body)
     }
 
+    /// The same frames, in fragments: tables that say where they begin, and of each fragment its own.
+    pub(crate) fn fragments(ticks: &[u32]) -> Vec<u8> {
+        let whole = file(ticks);
+        let (ftyp, rest) = whole.split_at(12);
+        let (mdat, moov) = rest.split_at(8 + 500 * ticks.len());
+        let trex = table(b"trex", &[0, 1, 1, 50, 500, 0]);
+        let begun = boxed(b"moov", &[&moov[8..], &boxed(b"mvex", &trex)].concat());
+        let moof = boxed(b"moof", &table(b"mfhd", &[0, 1]));
+        [ftyp, &begun, &moof, mdat].concat()
+    }
+
     /// An MP4 file of frames without contents, shown for `ticks` each at 1000 ticks a second.
     pub(crate) fn file(ticks: &[u32]) -> Vec<u8> {
         let n = ticks.len() as u32;
@@ -379,6 +397,24 @@ pub(crate) mod tests {
         }
         let lies = [&whole[..12], &whole[12 + 8 + 500 * 40..]].concat();
         assert!(read(&lies).unwrap_err().to_string().contains("frames of 500 bytes"), "no frames in it");
+    }
+
+    #[test]
+    fn files_in_fragments_are_not_damaged() {
+        let whole = fragments(&[50; 40]);
+        let begun = &whole[..whole.len() - 500 * 40 - 8 - 24]; // nothing but what fragments need
+        // Old tools leave out what announces them.
+        let mut silent = whole.clone();
+        let at = silent.windows(4).position(|w| w == b"mvex").unwrap();
+        silent[at..at + 4].copy_from_slice(b"free");
+        for bytes in [&whole[..], begun, &silent] {
+            let error = read(bytes).unwrap_err();
+            assert!(
+                error.is_unsupported() && error.to_string().contains("found a fragmented one"),
+                "{error}"
+            );
+        }
+        assert!(!read(&whole[..whole.len() - 1]).unwrap_err().is_unsupported(), "cut off");
     }
 
     #[test]

@@ -747,6 +747,15 @@ fn videos_are_looked_into() {
         let read = Dataset::open(&root).unwrap().read_columns(1, &["top"]).unwrap_err().to_string();
         assert!(read.contains("file-000.mp4: video"), "{read}");
     }
+    // In fragments it may be whole: nothing is cut.
+    std::fs::write(&path, super::mp4::tests::fragments(&[50; 40])).unwrap();
+    for report in [check(&root).unwrap(), repair(&root).unwrap()] {
+        let of_it = report.faults.iter().filter(|f| f.path == path);
+        assert!(of_it.clone().all(|f| f.message.contains("found a fragmented one")), "{report:?}");
+        assert_eq!((of_it.count() > 0, report.worst()), (true, Some(FaultKind::Unsupported)), "{report:?}");
+    }
+    assert_eq!(Dataset::open(&root).unwrap().len(), 2);
+
     std::fs::write(&path, super::mp4::tests::file(&[50; 39])).unwrap();
     let report = repair(&root).unwrap();
     assert!(report.is_sound() && report.whole == 1, "{report:?}");

@@ -12,6 +12,8 @@ use std::path::Path;
 
 /// What the `refine` example leaves beside its dataset: the fate of every frame of every recording.
 const FRAMES: &str = "report/frames.csv";
+/// Bytes of that file: more than ten hours of frames at 20 Hz.
+const LARGEST_FRAMES: u64 = 1 << 26;
 /// Entries of a column that are drawn one by one; of others the least, the mean and the largest.
 const WIDEST: usize = 64;
 /// Different texts of a column that are shown.
@@ -312,11 +314,11 @@ fn short(texts: &[String]) -> Vec<String> {
 
 /// Reads the report's table by the names of its columns; nothing where there is none.
 fn accounts(path: &Path) -> Result<BTreeMap<i64, Account>> {
-    let text = match std::fs::read_to_string(path) {
-        Ok(text) => text,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
-        Err(e) => return Err(io("reading", path)(e)),
-    };
+    if !path.try_exists().map_err(io("looking for", path))? {
+        return Ok(BTreeMap::new());
+    }
+    let bytes = e2h_data::read_regular(path, LARGEST_FRAMES)?;
+    let text = String::from_utf8_lossy(&bytes);
     let mut lines = text.lines();
     let head: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
     let column = |name: &str| head.iter().position(|h| *h == name);

@@ -11,6 +11,10 @@ use std::arch::x86_64::{__m256, __m512};
 /// Most rows of a tile, over all instruction sets.
 pub(super) const MAX_ROWS: usize = 12;
 
+/// Products that are summed in registers before they are added to the result. One sum over thousands of products loses
+/// digits with the root of their number; PyTorch's do not, because its products come in blocks too.
+const BLOCK: usize = 128;
+
 /// Which instructions the kernels use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Isa {
@@ -105,6 +109,21 @@ pub(super) struct Outer {
     pub(super) keep: bool,
 }
 
+/// Writes the sums of a tile, or with `add` adds them to the result.
+#[inline(always)]
+unsafe fn put<V: Vector, const MR: usize, const NV: usize>(sum: &[[V; NV]; MR], t: &Rows, add: bool) {
+    // SAFETY: as in `rows`.
+    unsafe {
+        for (i, sum) in sum.iter().enumerate() {
+            let y = (*t.to.add(i)).add(t.column);
+            for (j, sum) in sum.iter().enumerate() {
+                let y = y.add(j * V::LANES);
+                if add { sum.add(V::load(y)).store(y) } else { sum.store(y) }
+            }
+        }
+    }
+}
+
 #[allow(
     clippy::needless_range_loop,
     reason = "counts known at compile time unroll; iterators over two arrays hide that"
@@ -124,32 +143,40 @@ unsafe fn rows<V: Vector, const MR: usize, const NV: usize>(t: &Rows) {
                 }
             }
         }
+        // Products in `sum`, and whether the result holds a sum already.
+        let (mut count, mut begun) = (0, false);
         for tap in 0..t.taps {
             let mut at = [std::ptr::null::<f32>(); MR];
             for (i, at) in at.iter_mut().enumerate() {
                 *at = *t.at.add(tap * MAX_ROWS + i);
             }
             let mut w = (*t.w.add(tap)).add(t.w_column);
-            for k in 0..t.k {
-                let mut b = [V::zero(); NV];
-                for (j, b) in b.iter_mut().enumerate() {
-                    *b = V::load(w.add(j * V::LANES));
+            let mut from = 0;
+            while from < t.k {
+                let to = t.k.min(from + BLOCK);
+                if count + (to - from) > BLOCK {
+                    put::<V, MR, NV>(&sum, t, begun);
+                    sum = [[V::zero(); NV]; MR];
+                    (count, begun) = (0, true);
                 }
-                for i in 0..MR {
-                    let a = V::splat(at[i].add(k));
-                    for j in 0..NV {
-                        sum[i][j] = sum[i][j].fma(a, b[j]);
+                for k in from..to {
+                    let mut b = [V::zero(); NV];
+                    for (j, b) in b.iter_mut().enumerate() {
+                        *b = V::load(w.add(j * V::LANES));
                     }
+                    for i in 0..MR {
+                        let a = V::splat(at[i].add(k));
+                        for j in 0..NV {
+                            sum[i][j] = sum[i][j].fma(a, b[j]);
+                        }
+                    }
+                    w = w.add(t.row_step);
                 }
-                w = w.add(t.row_step);
+                count += to - from;
+                from = to;
             }
         }
-        for (i, sum) in sum.iter().enumerate() {
-            let y = (*t.to.add(i)).add(t.column);
-            for (j, sum) in sum.iter().enumerate() {
-                sum.store(y.add(j * V::LANES));
-            }
-        }
+        put::<V, MR, NV>(&sum, t, begun);
     }
 }
 
@@ -162,13 +189,6 @@ unsafe fn outer<V: Vector, const MR: usize, const NV: usize>(t: &Outer) {
     // SAFETY: as in `rows`.
     unsafe {
         let mut sum = [[V::zero(); NV]; MR];
-        if t.keep {
-            for (i, sum) in sum.iter_mut().enumerate() {
-                for (j, sum) in sum.iter_mut().enumerate() {
-                    *sum = V::load(t.to.add(i * t.to_step + j * V::LANES));
-                }
-            }
-        }
         let mut row = t.b;
         for r in 0..t.rows {
             let a = (*t.at.add(r)).add(t.first);
@@ -186,7 +206,8 @@ unsafe fn outer<V: Vector, const MR: usize, const NV: usize>(t: &Outer) {
         }
         for (i, sum) in sum.iter().enumerate() {
             for (j, sum) in sum.iter().enumerate() {
-                sum.store(t.to.add(i * t.to_step + j * V::LANES));
+                let y = t.to.add(i * t.to_step + j * V::LANES);
+                if t.keep { sum.add(V::load(y)).store(y) } else { sum.store(y) }
             }
         }
     }

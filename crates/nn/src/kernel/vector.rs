@@ -12,6 +12,7 @@ pub(super) trait Vector: Copy {
     unsafe fn store(self, p: *mut f32);
     /// All lanes the number at `p`.
     unsafe fn splat(p: *const f32) -> Self;
+    unsafe fn add(self, other: Self) -> Self;
     /// `a * b + self`.
     unsafe fn fma(self, a: Self, b: Self) -> Self;
 }
@@ -42,6 +43,10 @@ impl Vector for Plain {
         Self([unsafe { *p }; 8])
     }
     #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i] + other.0[i]))
+    }
+    #[inline(always)]
     unsafe fn fma(self, a: Self, b: Self) -> Self {
         let fused = cfg!(target_arch = "aarch64");
         Self(std::array::from_fn(|i| {
@@ -52,7 +57,7 @@ impl Vector for Plain {
 
 #[cfg(target_arch = "x86_64")]
 macro_rules! intel {
-    ($type:ident, $lanes:expr, $zero:ident, $load:ident, $store:ident, $splat:ident, $fma:ident) => {
+    ($type:ident, $lanes:expr, $zero:ident, $load:ident, $store:ident, $splat:ident, $add:ident, $fma:ident) => {
         impl Vector for std::arch::x86_64::$type {
             const LANES: usize = $lanes;
             #[inline(always)]
@@ -73,6 +78,10 @@ macro_rules! intel {
                 unsafe { std::arch::x86_64::$splat(*p) }
             }
             #[inline(always)]
+            unsafe fn add(self, other: Self) -> Self {
+                unsafe { std::arch::x86_64::$add(self, other) }
+            }
+            #[inline(always)]
             unsafe fn fma(self, a: Self, b: Self) -> Self {
                 unsafe { std::arch::x86_64::$fma(a, b, self) }
             }
@@ -81,6 +90,24 @@ macro_rules! intel {
 }
 
 #[cfg(target_arch = "x86_64")]
-intel!(__m512, 16, _mm512_setzero_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_set1_ps, _mm512_fmadd_ps);
+intel!(
+    __m512,
+    16,
+    _mm512_setzero_ps,
+    _mm512_loadu_ps,
+    _mm512_storeu_ps,
+    _mm512_set1_ps,
+    _mm512_add_ps,
+    _mm512_fmadd_ps
+);
 #[cfg(target_arch = "x86_64")]
-intel!(__m256, 8, _mm256_setzero_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_set1_ps, _mm256_fmadd_ps);
+intel!(
+    __m256,
+    8,
+    _mm256_setzero_ps,
+    _mm256_loadu_ps,
+    _mm256_storeu_ps,
+    _mm256_set1_ps,
+    _mm256_add_ps,
+    _mm256_fmadd_ps
+);

@@ -1,6 +1,6 @@
 //! Against LeRobot 0.4.4 on torch 2.7.1; see `tests/golden/README.md`.
 
-use crate::support::{Golden, assert_close, elsewhere, filled, loss, values, wide};
+use crate::support::{Golden, assert_close, difference, elsewhere, filled, input, loss, values, wide};
 use e2h_nn::{ConditionalUnet1d, Mode, RgbEncoder, RgbEncoderConfig, UnetConfig, backward};
 
 fn unet() -> UnetConfig {
@@ -55,6 +55,55 @@ fn rgb_encoder_as_in_lerobot() {
     assert_close("output", &wide(&values(&y)), &golden.get("out").1, 1e-4);
     let grads = backward(&loss(&y), &params).unwrap().export(&params).unwrap();
     golden.compare_gradients(&grads, 5e-4);
+}
+
+/// Against float64. Where a number lies beside a kink, one rounding more or less turns a whole path on or off: single cases say
+/// nothing, their middle does.
+#[test]
+fn the_rgb_encoder_rounds_no_worse_than_torch() {
+    const SAMPLES: usize = 16;
+    let golden = Golden::open("rounding");
+    let config = RgbEncoderConfig {
+        height: 72,
+        width: 64,
+        base_width: 64,
+        stage_blocks: vec![2, 2, 2, 2],
+        keypoints: 32,
+        feature_dim: 64,
+    };
+    let (params, net) = filled(Mode::Train, |b| RgbEncoder::new(&config, b));
+    let (mut ours, mut torch) = ([vec![], vec![]], [vec![], vec![]]);
+    for case in 0..25 {
+        let x = input(1020 + case, &[2, 3, 72, 64], 0.5, 0.5).permute((0, 2, 3, 1)).unwrap();
+        let y = net.forward(&x).unwrap();
+        ours[0].push(difference(&wide(&values(&y)), &golden.get(&format!("out.{case}")).1));
+        let grads = backward(&loss(&y), &params).unwrap().export(&params).unwrap();
+        let (_, expected) = golden.get(&format!("grad.{case}"));
+        let mut off = vec![];
+        for ((name, g), want) in grads.iter().zip(expected.chunks_exact(SAMPLES)) {
+            let step = g.data.len() / SAMPLES;
+            let got: Vec<f32> = g.data.iter().step_by(step).take(SAMPLES).copied().collect();
+            let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|v| v * v).sum::<f64>().sqrt();
+            let size = norm(&mut want.iter().copied());
+            if name != "pool.nets.bias" && size > 0.0 {
+                off.push(norm(&mut wide(&got).iter().zip(want).map(|(a, b)| a - b)) / size);
+            }
+        }
+        ours[1].push(middle(off));
+        let (_, found) = golden.get(&format!("torch.{case}"));
+        torch[0].push(found[0]);
+        torch[1].push(found[1]);
+    }
+    for (what, (ours, torch)) in ["output", "gradients"].iter().zip(ours.into_iter().zip(torch)) {
+        let (ours, torch) = (middle(ours), middle(torch));
+        println!("{what}: {ours:.2e} from float64, torch {torch:.2e}");
+        assert!(ours <= torch, "{what}: {ours:.2e} from float64, torch {torch:.2e}");
+    }
+}
+
+fn middle(mut v: Vec<f64>) -> f64 {
+    v.sort_by(f64::total_cmp);
+    v[v.len() / 2]
 }
 
 #[test]

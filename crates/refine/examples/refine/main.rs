@@ -22,10 +22,11 @@ use config::Config;
 use e2h_core::{Direction, Episode, Origin};
 use e2h_data::lerobot::{
     ACTION_NAMES, Column, ColumnSlice, Dataset, Dtype, Feature, Features, Info, RobotColumns, Rotation,
-    STATE_NAMES, Table, Writer, source_columns, source_features,
+    STATE_NAMES, Table, Writer, decode_png, source_columns, source_features,
 };
 use e2h_refine::{Refined, gate, gripper_switches, kinematic_filter, resample, reverse};
 use page::{Account, Verdict};
+use serde::Serialize;
 use std::path::PathBuf;
 
 /// Reverses and filters a dataset of easy-direction episodes.
@@ -88,6 +89,13 @@ struct Arguments {
     json: bool,
 }
 
+/// A recording that --skip-broken passed over.
+#[derive(Serialize)]
+struct LeftOut {
+    episode: usize,
+    reason: String,
+}
+
 /// What becomes of one recording.
 struct Plan {
     episode: usize,
@@ -128,11 +136,17 @@ fn program() -> Result<()> {
     );
 
     // Poses alone first: they are small, and the critic's threshold is one of all episodes.
-    let mut plans = vec![];
-    for i in 0..dataset.len() {
-        match plan(&dataset, &columns, &config, &a, i) {
+    let (mut plans, mut left_out) = (vec![], vec![]);
+    for episode in 0..dataset.len() {
+        let found = plan(&dataset, &columns, &config, &a, episode);
+        // Without --skip-broken the first image that cannot be decoded ends the work when it is asked for.
+        match found.and_then(|p| if a.skip_broken { whole_images(&dataset, &cameras, p) } else { Ok(p) }) {
             Ok(plan) => plans.push(plan),
-            Err(e) if a.skip_broken => eprintln!("left out episode {i}: {e:#}"),
+            Err(e) if a.skip_broken => {
+                let reason = e2h_core::one_line(&format!("{e:#}"));
+                eprintln!("left out episode {episode}: {reason}");
+                left_out.push(LeftOut { episode, reason });
+            }
             Err(e) => return Err(e),
         }
     }
@@ -171,18 +185,18 @@ fn program() -> Result<()> {
     let info = writer.finish()?;
 
     let accounts: Vec<&Account> = plans.iter().map(|p| &p.account).collect();
-    let report = page::json(&a, &config, judge.as_ref(), &accounts, &info);
+    let report = page::json(&a, &config, judge.as_ref(), &accounts, &left_out, &info);
     e2h_data::write_atomic(&a.out.join("report/frames.csv"), page::csv(&plans, a.fps).as_bytes())?;
     e2h_data::write_atomic(
         &a.out.join("report/report.json"),
         serde_json::to_string_pretty(&report)?.as_bytes(),
     )?;
-    let html = page::html(&a, &config, judge.as_ref(), &accounts, &info, &drawn)?;
+    let html = page::html(&a, &config, judge.as_ref(), &accounts, &left_out, &info, &drawn)?;
     e2h_data::write_atomic(&a.out.join("report/report.html"), html.as_bytes())?;
     if a.json {
         println!("{report}");
     } else {
-        print!("{}", page::text(&accounts, judge.as_ref()));
+        print!("{}", page::text(&accounts, &left_out, judge.as_ref()));
         println!("dataset: {}", a.out.display());
         println!("report: {}", a.out.join("report/report.html").display());
     }
@@ -277,6 +291,19 @@ fn plan(
     let account =
         Account::new(episode, &recorded, info.fps, &reversed, refined.as_ref(), fps, verdict, switches);
     Ok(Plan { episode, reversed, refined, account })
+}
+
+/// The plan again, if every image of the recording can be decoded.
+fn whole_images(dataset: &Dataset, cameras: &[(String, Feature)], plan: Plan) -> Result<Plan> {
+    for (name, feature) in cameras {
+        // One camera at a time: an episode's images are most of the memory.
+        let table = dataset.read_columns(plan.episode, &[name.as_str()])?;
+        let Some((height, width)) = feature.image_size() else { bail!("{name}: expected an image") };
+        for (row, file) in table.png(name)?.iter().enumerate() {
+            decode_png(file, height, width, &format!("column `{name}`, row {row}"))?;
+        }
+    }
+    Ok(plan)
 }
 
 fn features(a: &Arguments, info: &Info, cameras: &[(String, Feature)]) -> Result<Features> {

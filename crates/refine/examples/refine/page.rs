@@ -2,7 +2,7 @@
 
 use crate::config::Config;
 use crate::critic::Judge;
-use crate::{Arguments, Plan};
+use crate::{Arguments, LeftOut, Plan};
 use anyhow::Result;
 use e2h_core::Episode;
 use e2h_data::lerobot::Info;
@@ -180,25 +180,26 @@ pub(crate) fn json(
     config: &Config,
     judge: Option<&Judge>,
     accounts: &[&Account],
+    left_out: &[LeftOut],
     info: &Info,
 ) -> Value {
     let s = sums(accounts);
     let critic = judge.map(|j| json!({"folder": j.folder, "about": j.about}));
     json!({
         "dataset": a.dataset, "out": a.out, "fps": a.fps, "config": config,
-        "episodes_in": accounts.len(), "episodes_accepted": s.accepted, "episodes_out": info.total_episodes,
+        "episodes_in": accounts.len() + left_out.len(), "left_out": left_out, "episodes_accepted": s.accepted, "episodes_out": info.total_episodes,
         "frames_out": info.total_frames, "recorded": s.recorded, "before": s.before, "after": s.after,
         "fates": s.fates, "critic": critic, "episodes": accounts,
     })
 }
 
 /// The same in lines for a terminal.
-pub(crate) fn text(accounts: &[&Account], judge: Option<&Judge>) -> String {
+pub(crate) fn text(accounts: &[&Account], left_out: &[LeftOut], judge: Option<&Judge>) -> String {
     let s = sums(accounts);
     let mut out = format!(
         "{} of {} recordings accepted\n{:>10} {:>8} {:>9} {:>8} {:>10}\n",
         s.accepted,
-        accounts.len(),
+        accounts.len() + left_out.len(),
         "",
         "frames",
         "s",
@@ -221,6 +222,9 @@ pub(crate) fn text(accounts: &[&Account], judge: Option<&Judge>) -> String {
     for account in accounts.iter().filter(|a| a.verdict != Verdict::Accepted) {
         out += &format!("episode {}: {}\n", account.episode, account.verdict);
     }
+    for broken in left_out {
+        out += &format!("episode {}: left out, {}\n", broken.episode, broken.reason);
+    }
     out
 }
 
@@ -230,6 +234,7 @@ pub(crate) fn html(
     config: &Config,
     judge: Option<&Judge>,
     accounts: &[&Account],
+    left_out: &[LeftOut],
     info: &Info,
     pictures: &[String],
 ) -> Result<String> {
@@ -254,6 +259,11 @@ pub(crate) fn html(
             x.gripper.1
         )
     };
+    let broken = |x: &LeftOut| format!("<li>episode {}: {}", x.episode, escape(&x.reason));
+    let broken = match left_out {
+        [] => String::new(),
+        some => format!("<h2>Left out</h2><ul>{}</ul>", some.iter().map(broken).collect::<String>()),
+    };
     Ok(format!(
         "<!doctype html><meta charset=utf-8><title>Refinement</title><style>\
          body{{font:15px/1.5 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em}}\
@@ -270,9 +280,9 @@ pub(crate) fn html(
          <tr><th>all<td>{}<td>frames of accepted recordings, reversed</table>\
          <p>Every frame: <code>frames.csv</code> beside this page.</p>\
          <h2>Episodes</h2><table><tr><th>episode<th>verdict<th>recorded<th>reversed<th>kept<th>static<th>re-timed\
-         <th>critic<th>written<th>closes / opens{}</table><h2>Pictures</h2>{}<h2>Values</h2><pre>{}</pre>\n",
+         <th>critic<th>written<th>closes / opens{}</table>{broken}<h2>Pictures</h2>{}<h2>Values</h2><pre>{}</pre>\n",
         s.accepted,
-        accounts.len(),
+        accounts.len() + left_out.len(),
         escape(&a.dataset.display().to_string()),
         info.total_episodes,
         info.total_frames,

@@ -1,5 +1,5 @@
 use crate::{Error, Result};
-use candle_core::{Device, Tensor};
+use candle_core::{Device, DeviceLocation, Tensor};
 use std::cell::Cell;
 
 thread_local! {
@@ -55,6 +55,16 @@ impl Compute {
     #[must_use]
     pub fn cpu() -> Self {
         Self { device: Device::Cpu, bf16: false, name: "cpu".to_owned() }
+    }
+
+    /// The device of tensors that are there already; products are in `f32`.
+    pub(crate) fn of(device: &Device) -> Self {
+        let name = match device.location() {
+            DeviceLocation::Cpu => return Self::cpu(),
+            DeviceLocation::Cuda { gpu_id } => format!("cuda:{gpu_id}"),
+            DeviceLocation::Metal { gpu_id } => format!("metal:{gpu_id}"),
+        };
+        Self { device: device.clone(), bf16: false, name }
     }
 
     /// Opens `cpu`, `cuda` (the first GPU) or `cuda:N`.

@@ -1,7 +1,8 @@
 use crate::graph;
 use crate::kernel::{self, add_assign};
 use crate::numbers::{Numbers, elsewhere};
-use crate::params::{Params, with};
+use crate::params::Params;
+use crate::storage::with;
 use crate::weights::Weights;
 use crate::{Error, Result};
 use candle_core::{Tensor, TensorId};

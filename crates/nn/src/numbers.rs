@@ -1,4 +1,4 @@
-use crate::params::{host, with};
+use crate::storage::{host, with};
 use crate::{Error, Result};
 use candle_core::{Tensor, Var};
 use std::borrow::Cow;

@@ -9,10 +9,11 @@
 use crate::compute::through_candle;
 use crate::grad;
 use crate::kernel::add_assign;
-use crate::params::{Weight, slice};
+use crate::params::Weight;
+use crate::storage::slice;
 use crate::{Error, Result};
 use candle_core::{
-    CpuStorage, CustomOp1, CustomOp2, CustomOp3, Device, Layout, Shape, StorageRef, Tensor, TensorId,
+    CpuStorage, CustomOp1, CustomOp2, CustomOp3, DType, Device, Layout, Shape, StorageRef, Tensor, TensorId,
 };
 use std::ops::Deref;
 use std::sync::Mutex;
@@ -217,9 +218,11 @@ impl Whole {
         let mut grads = flow.grads;
         let mut out = [None, None, None];
         for (o, n) in out.iter_mut().zip(&self.tracked) {
-            if let Some(g) = grads[n.0].take() {
-                *o = Some(Tensor::from_vec(g, tape.shape(*n), &Device::Cpu)?);
-            }
+            // Candle panics where what lies before an input gets no gradient.
+            *o = Some(match grads[n.0].take() {
+                Some(g) => Tensor::from_vec(g, tape.shape(*n), &Device::Cpu)?,
+                None => Tensor::zeros(tape.shape(*n), DType::F32, &Device::Cpu)?,
+            });
         }
         Ok(out)
     }

@@ -2,7 +2,8 @@ use crate::grad::Grads;
 use crate::graph;
 use crate::kernel::optim;
 use crate::numbers::{Numbers, elsewhere};
-use crate::params::{Params, edit};
+use crate::params::Params;
+use crate::storage::edit;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
 

@@ -1,7 +1,8 @@
 use crate::graph;
 use crate::kernel::optim;
 use crate::numbers::{Numbers, elsewhere};
-use crate::params::{Params, with};
+use crate::params::Params;
+use crate::storage::with;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
 

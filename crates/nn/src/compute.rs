@@ -20,9 +20,24 @@ pub fn candle_operations<R>(f: impl FnOnce() -> R) -> R {
     f()
 }
 
-/// Whether an operation without weights goes through Candle.
-pub(crate) fn through_candle(inputs: &[&Tensor]) -> bool {
-    CANDLE.get() || inputs.iter().any(|t| !t.device().is_cpu())
+/// What computes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Backend {
+    /// Our kernels on the CPU: a tape records them, gradients are plain numbers.
+    Kernels,
+    /// Candle's operations, which Candle tracks: gradients are tensors.
+    Candle,
+}
+
+impl Backend {
+    fn on(cpu: bool) -> Self {
+        if CANDLE.get() || !cpu { Self::Candle } else { Self::Kernels }
+    }
+
+    /// For an operation without weights.
+    pub(crate) fn of(inputs: &[&Tensor]) -> Self {
+        Self::on(inputs.iter().all(|t| t.device().is_cpu()))
+    }
 }
 
 /// How exact a GPU multiplies. The CPU always computes in `f32`.
@@ -111,9 +126,9 @@ impl Compute {
         self.bf16
     }
 
-    /// Whether networks built now are made of Candle's operations.
-    pub(crate) fn through_candle(&self) -> bool {
-        CANDLE.get() || !self.device.is_cpu()
+    /// What computes networks that are built now.
+    pub(crate) fn backend(&self) -> Backend {
+        Backend::on(self.device.is_cpu())
     }
 }
 

@@ -1,4 +1,4 @@
-use crate::compute::Compute;
+use crate::compute::{Backend, Compute};
 use crate::kernel::conv::in_panels;
 use crate::numbers::Numbers;
 use crate::storage::{edit, host, with};
@@ -29,8 +29,8 @@ pub(crate) type Order = Option<&'static [usize]>;
 pub(crate) struct Weight {
     pub(crate) tensor: Tensor,
     pub(crate) train: bool,
-    /// Whether it is for Candle's operations, uncut, instead of our kernels.
-    pub(crate) graph: bool,
+    /// What reads it.
+    pub(crate) backend: Backend,
     /// Whether products read it as `bf16`.
     pub(crate) bf16: bool,
 }
@@ -177,13 +177,18 @@ impl Builder<'_> {
                 return Err(Error::Config { what: "network", expected: "at most 65536 parameters", found });
             }
             state.shapes.insert(name, shape.to_vec());
-            return Ok(Weight { tensor: nothing.clone(), train: false, graph: false, bf16: false });
+            return Ok(Weight {
+                tensor: nothing.clone(),
+                train: false,
+                backend: Backend::Kernels,
+                bf16: false,
+            });
         }
         let data = init.draw(shape.iter().product(), &mut state.rng);
         let inner: Vec<usize> = order.map_or(shape.to_vec(), |o| o.iter().map(|a| shape[*a]).collect());
         let compute = &self.shared.compute;
-        let (graph, bf16) = (compute.through_candle(), compute.bf16());
-        let cut = order.is_some() && !graph;
+        let (backend, bf16) = (compute.backend(), compute.bf16());
+        let cut = order.is_some() && backend == Backend::Kernels;
         let data = if cut { in_panels(&data, inner.last().copied().unwrap_or(1), false) } else { data };
         let var = Var::from_vec(data, inner, compute.device())?;
         let train = self.shared.mode == Mode::Train;
@@ -192,7 +197,7 @@ impl Builder<'_> {
         if state.params.insert(name.clone(), param).is_some() {
             state.duplicate = Some(name);
         }
-        Ok(Weight { tensor, train, graph, bf16 })
+        Ok(Weight { tensor, train, backend, bf16 })
     }
 
     /// A tensor in PyTorch's layout for Candle's operations: the parameter `name`, made where there is none of that name
@@ -239,8 +244,7 @@ impl Builder<'_> {
 pub struct Params {
     params: Arc<BTreeMap<String, Param>>,
     compute: Compute,
-    /// Whether gradients and what follows them are tensors.
-    graph: bool,
+    backend: Backend,
 }
 
 impl std::fmt::Debug for Params {
@@ -286,7 +290,7 @@ impl Params {
     }
 
     fn of(params: BTreeMap<String, Param>, compute: &Compute) -> Self {
-        Self { params: Arc::new(params), compute: compute.clone(), graph: compute.through_candle() }
+        Self { params: Arc::new(params), compute: compute.clone(), backend: compute.backend() }
     }
 
     /// `vars` themselves as parameters, all on one device and of `f32`.
@@ -340,12 +344,11 @@ impl Params {
     pub fn is_on(&self, compute: &Compute) -> bool {
         self.compute.device().same_device(compute.device())
             && self.compute.bf16() == compute.bf16()
-            && self.graph == compute.through_candle()
+            && self.backend == compute.backend()
     }
 
-    /// Whether gradients and what follows them are tensors.
-    pub(crate) fn in_graph(&self) -> bool {
-        self.graph
+    pub(crate) fn backend(&self) -> Backend {
+        self.backend
     }
 
     /// All parameters in PyTorch's layout.
@@ -355,7 +358,7 @@ impl Params {
     pub fn export(&self) -> Result<Weights> {
         let mut out = Weights::new();
         for (name, p) in self.params.iter() {
-            let tensor = if self.graph {
+            let tensor = if self.backend == Backend::Candle {
                 p.outward(&host(p.var.as_tensor())?)
             } else {
                 with(p.var.as_tensor(), |d| p.outward(d))?
@@ -373,7 +376,7 @@ impl Params {
         self.matches(weights)?;
         for (param, tensor) in self.params.values().zip(weights.values()) {
             let data = param.inward(&tensor.data);
-            if self.graph {
+            if self.backend == Backend::Candle {
                 param.var.set(&Tensor::from_vec(data, param.var.shape(), param.var.device())?)?;
             } else {
                 edit(&param.var, |p| p.copy_from_slice(&data))?;
@@ -429,7 +432,7 @@ impl Params {
     pub(crate) fn all_inward(&self, weights: &Weights) -> Result<Vec<Numbers>> {
         self.matches(weights)?;
         let each = self.params.values().zip(weights.values());
-        each.map(|(p, t)| Numbers::new(p.inward(&t.data), &p.var, self.graph)).collect()
+        each.map(|(p, t)| Numbers::new(p.inward(&t.data), &p.var, self.backend)).collect()
     }
 }
 

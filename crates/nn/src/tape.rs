@@ -6,7 +6,7 @@
 //!
 //! On other devices nothing is recorded: values are tensors that Candle tracks, see [`crate::graph`].
 
-use crate::compute::through_candle;
+use crate::compute::Backend;
 use crate::grad;
 use crate::kernel::add_assign;
 use crate::params::Weight;
@@ -48,7 +48,7 @@ pub(crate) struct Tape {
     slots: Vec<Slot>,
     steps: Vec<(Node, Box<dyn Step>)>,
     record: bool,
-    graph: bool,
+    backend: Backend,
 }
 
 /// The numbers of a value, wherever they live.
@@ -95,7 +95,7 @@ impl Tape {
 
     /// Whether layers are to compute with Candle's operations, on [`Tape::tensor`] and [`Tape::put`].
     pub(crate) fn in_graph(&self) -> bool {
-        self.graph
+        self.backend == Backend::Candle
     }
 
     /// A value as Candle sees it.
@@ -325,9 +325,9 @@ pub(crate) fn run(
 ) -> Result<Tensor> {
     let anchor = weight.filter(|w| w.train).map(|w| &w.tensor);
     let record = grad::enabled() && (anchor.is_some() || inputs.iter().any(|t| t.track_op()));
-    let graph = weight.map_or_else(|| through_candle(inputs), |w| w.graph);
-    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record, graph };
-    if graph {
+    let backend = weight.map_or_else(|| Backend::of(inputs), |w| w.backend);
+    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record, backend };
+    if backend == Backend::Candle {
         return run_tracked(tape, inputs, weight, f);
     }
     let mut nodes = Vec::with_capacity(inputs.len());

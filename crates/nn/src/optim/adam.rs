@@ -98,7 +98,7 @@ impl Adam {
     pub fn new(config: &AdamConfig, params: &Params) -> Result<Self> {
         config.validate()?;
         let zeros: Result<Vec<Numbers>> =
-            params.variables().map(|v| Numbers::zeros(v, params.in_graph())).collect();
+            params.variables().map(|v| Numbers::zeros(v, params.backend())).collect();
         let mean = zeros?;
         Ok(Self { config: *config, params: params.clone(), square: mean.clone(), mean, steps: 0 })
     }

@@ -88,7 +88,7 @@ impl<'a> Builder<'a> {
 
 impl Params {
     /// The variables of a candle-nn model, for [`crate::backward`], [`crate::Adam`], [`crate::Ema`] and weight files: the
-    /// variables themselves, not copies.
+    /// variables themselves, not copies, as many as `map` holds now.
     ///
     /// # Errors
     /// [`Error::Config`] unless they are of `f32` and on one device.

@@ -128,6 +128,15 @@ fn a_mixed_network_has_exact_gradients() {
     candle_operations(|| check(&input(2, &[3, 8, 6, 3]), 3e-3, 1e-2, Mixed::new));
 }
 
+/// What `Builder::var_builder` warns of. Should Candle mend it, the warning goes.
+#[test]
+#[should_panic(expected = "weight: off by")]
+fn candles_own_conv1d_learns_from_a_wrong_gradient() {
+    check(&input(3, &[2, 3, 10]), 1e-2, 0.1, |b| {
+        Ok(candle_nn::conv1d(3, 4, 5, candle_nn::Conv1dConfig::default(), b.var_builder())?)
+    });
+}
+
 /// Losses of the first and the last of 150 steps.
 fn train(params: &Params, net: &impl Module) -> (f32, f32) {
     let (x, y) = (input(3, &[16, 8, 6, 3]), input(4, &[16, 2]));

@@ -58,6 +58,14 @@ fn core_and_refine_stand_on_nothing_heavy() {
 }
 
 #[test]
+fn a_layer_of_ones_own_needs_candle_and_one_crate() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/open_layers");
+    let mut found = dependencies(&path);
+    found.sort();
+    assert_eq!(found, ["candle-core", "candle-nn", "e2h-nn"]);
+}
+
+#[test]
 fn methods_name_no_task_and_tasks_no_method() {
     for (name, path) in crates() {
         let words: &[&str] = match name.as_str() {

@@ -1,5 +1,5 @@
 use crate::{Error, Result};
-use candle_core::{Device, Tensor};
+use candle_core::{Device, DeviceLocation, Tensor};
 use std::cell::Cell;
 
 thread_local! {
@@ -20,9 +20,24 @@ pub fn candle_operations<R>(f: impl FnOnce() -> R) -> R {
     f()
 }
 
-/// Whether an operation without weights goes through Candle.
-pub(crate) fn through_candle(inputs: &[&Tensor]) -> bool {
-    CANDLE.get() || inputs.iter().any(|t| !t.device().is_cpu())
+/// What computes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Backend {
+    /// Our kernels on the CPU: a tape records them, gradients are plain numbers.
+    Kernels,
+    /// Candle's operations, which Candle tracks: gradients are tensors.
+    Candle,
+}
+
+impl Backend {
+    fn on(cpu: bool) -> Self {
+        if CANDLE.get() || !cpu { Self::Candle } else { Self::Kernels }
+    }
+
+    /// For an operation without weights.
+    pub(crate) fn of(inputs: &[&Tensor]) -> Self {
+        Self::on(inputs.iter().all(|t| t.device().is_cpu()))
+    }
 }
 
 /// How exact a GPU multiplies. The CPU always computes in `f32`.
@@ -55,6 +70,16 @@ impl Compute {
     #[must_use]
     pub fn cpu() -> Self {
         Self { device: Device::Cpu, bf16: false, name: "cpu".to_owned() }
+    }
+
+    /// The device of tensors that are there already; products are in `f32`.
+    pub(crate) fn of(device: &Device) -> Self {
+        let name = match device.location() {
+            DeviceLocation::Cpu => return Self::cpu(),
+            DeviceLocation::Cuda { gpu_id } => format!("cuda:{gpu_id}"),
+            DeviceLocation::Metal { gpu_id } => format!("metal:{gpu_id}"),
+        };
+        Self { device: device.clone(), bf16: false, name }
     }
 
     /// Opens `cpu`, `cuda` (the first GPU) or `cuda:N`.
@@ -101,9 +126,9 @@ impl Compute {
         self.bf16
     }
 
-    /// Whether networks built now are made of Candle's operations.
-    pub(crate) fn through_candle(&self) -> bool {
-        CANDLE.get() || !self.device.is_cpu()
+    /// What computes networks that are built now.
+    pub(crate) fn backend(&self) -> Backend {
+        Backend::on(self.device.is_cpu())
     }
 }
 

@@ -90,5 +90,15 @@ pub enum Error {
     Candle(#[from] candle_core::Error),
 }
 
+/// For layers that implement Candle's `Module`.
+impl From<Error> for candle_core::Error {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Candle(e) => e,
+            other => Self::wrap(other),
+        }
+    }
+}
+
 /// Results of this crate.
 pub type Result<T> = std::result::Result<T, Error>;

@@ -1,7 +1,9 @@
+use crate::compute::Backend;
 use crate::graph;
 use crate::kernel::{self, add_assign};
 use crate::numbers::{Numbers, elsewhere};
-use crate::params::{Params, with};
+use crate::params::Params;
+use crate::storage::with;
 use crate::weights::Weights;
 use crate::{Error, Result};
 use candle_core::{Tensor, TensorId};
@@ -123,7 +125,7 @@ impl Grads {
         self.check(params)?;
         let full = |(g, v): (&Option<Numbers>, &candle_core::Var)| match g {
             Some(g) => Ok(g.clone()),
-            None => Numbers::zeros(v, params.in_graph()),
+            None => Numbers::zeros(v, params.backend()),
         };
         let list: Result<Vec<Numbers>> = self.list.iter().zip(params.variables()).map(full).collect();
         params.all_outward(&list?)
@@ -178,7 +180,7 @@ pub fn backward_many(loss: &Tensor, networks: &[&Params]) -> Result<Vec<Grads>> 
     for params in networks {
         let mut list = Vec::with_capacity(params.len());
         for var in params.variables() {
-            if params.in_graph() {
+            if params.backend() == Backend::Candle {
                 let g = store.get(var.as_tensor()).map(Tensor::contiguous).transpose()?;
                 list.push(g.map(Numbers::Device));
                 continue;

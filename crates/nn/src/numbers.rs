@@ -1,4 +1,5 @@
-use crate::params::{host, with};
+use crate::compute::Backend;
+use crate::storage::{host, with};
 use crate::{Error, Result};
 use candle_core::{Tensor, Var};
 use std::borrow::Cow;
@@ -11,24 +12,27 @@ pub(crate) enum Numbers {
 }
 
 impl Numbers {
-    /// `data` beside `var`; `graph` as in [`crate::Params`].
-    pub(crate) fn new(data: Vec<f32>, var: &Var, graph: bool) -> Result<Self> {
-        if !graph {
+    /// `data` beside `var`.
+    pub(crate) fn new(data: Vec<f32>, var: &Var, backend: Backend) -> Result<Self> {
+        if backend == Backend::Kernels {
             return Ok(Self::Host(data));
         }
         Ok(Self::Device(Tensor::from_vec(data, var.shape(), var.device())?))
     }
 
-    pub(crate) fn zeros(var: &Var, graph: bool) -> Result<Self> {
-        if graph { Ok(Self::Device(var.zeros_like()?)) } else { Ok(Self::Host(vec![0.0; var.elem_count()])) }
+    pub(crate) fn zeros(var: &Var, backend: Backend) -> Result<Self> {
+        match backend {
+            Backend::Kernels => Ok(Self::Host(vec![0.0; var.elem_count()])),
+            Backend::Candle => Ok(Self::Device(var.zeros_like()?)),
+        }
     }
 
     /// The present numbers of `var`.
-    pub(crate) fn copy(var: &Var, graph: bool) -> Result<Self> {
-        if graph {
-            return Ok(Self::Device(var.as_detached_tensor().force_contiguous()?));
+    pub(crate) fn copy(var: &Var, backend: Backend) -> Result<Self> {
+        match backend {
+            Backend::Kernels => with(var.as_tensor(), |v| Self::Host(v.to_vec())),
+            Backend::Candle => Ok(Self::Device(var.as_detached_tensor().force_contiguous()?)),
         }
-        with(var.as_tensor(), |v| Self::Host(v.to_vec()))
     }
 
     pub(crate) fn len(&self) -> usize {

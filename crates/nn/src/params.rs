@@ -1,14 +1,15 @@
-use crate::compute::Compute;
+use crate::compute::{Backend, Compute};
 use crate::kernel::conv::in_panels;
 use crate::numbers::Numbers;
+use crate::storage::{edit, host, with};
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
-use candle_core::{CpuStorage, DType, InplaceOp1, Layout, Storage, Tensor, Var};
+use candle_core::{DType, Device, Tensor, Var};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
+use std::f64::consts::TAU;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// What a network is built for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,8 +29,8 @@ pub(crate) type Order = Option<&'static [usize]>;
 pub(crate) struct Weight {
     pub(crate) tensor: Tensor,
     pub(crate) train: bool,
-    /// Whether it is for Candle's operations, uncut, instead of our kernels.
-    pub(crate) graph: bool,
+    /// What reads it.
+    pub(crate) backend: Backend,
     /// Whether products read it as `bf16`.
     pub(crate) bf16: bool,
 }
@@ -37,10 +38,39 @@ pub(crate) struct Weight {
 /// How a parameter starts.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Init {
-    /// Uniform in plus or minus this.
-    Uniform(f32),
-    Ones,
-    Zeros,
+    Constant(f32),
+    /// Uniform in `mid` plus or minus `half`.
+    Uniform {
+        mid: f32,
+        half: f32,
+    },
+    Normal {
+        mean: f32,
+        deviation: f32,
+    },
+}
+
+impl Init {
+    /// Uniform in plus or minus `bound`.
+    pub(crate) const fn within(bound: f32) -> Self {
+        Self::Uniform { mid: 0.0, half: bound }
+    }
+
+    fn draw(self, n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
+        match self {
+            Self::Constant(c) => vec![c; n],
+            Self::Uniform { mid, half } => {
+                (0..n).map(|_| mid + (2.0 * rng.random::<f32>() - 1.0) * half).collect()
+            }
+            // Box and Muller; 1 - u is never 0.
+            Self::Normal { mean, deviation } => (0..n)
+                .map(|_| {
+                    let (u, v) = (1.0 - rng.random::<f64>(), rng.random::<f64>());
+                    mean + deviation * ((-2.0 * u.ln()).sqrt() * (TAU * v).cos()) as f32
+                })
+                .collect(),
+        }
+    }
 }
 
 struct Param {
@@ -77,14 +107,37 @@ impl Param {
     }
 }
 
+/// What one network is built from; behind a lock because `candle_nn::VarBuilder` wants to cross threads.
 struct Shared {
     mode: Mode,
     compute: Compute,
-    rng: RefCell<ChaCha8Rng>,
-    params: RefCell<BTreeMap<String, Param>>,
-    duplicate: Cell<Option<String>>,
-    /// Where only names and shapes are asked for: those, and what stands in for every weight.
-    plan: Option<(RefCell<Shapes>, Tensor)>,
+    state: Mutex<State>,
+    /// Where only names and shapes are asked for: what stands in for every weight.
+    plan: Option<Tensor>,
+}
+
+struct State {
+    rng: ChaCha8Rng,
+    params: BTreeMap<String, Param>,
+    duplicate: Option<String>,
+    /// Instead of parameters, where only these are asked for.
+    shapes: Shapes,
+}
+
+impl Shared {
+    fn new(mode: Mode, compute: &Compute, rng: ChaCha8Rng, plan: Option<Tensor>) -> Self {
+        let (params, shapes) = (BTreeMap::new(), Shapes::new());
+        let state = Mutex::new(State { rng, params, duplicate: None, shapes });
+        Self { mode, compute: compute.clone(), state, plan }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn into_state(self) -> State {
+        self.state.into_inner().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 /// Shapes by name.
@@ -117,37 +170,70 @@ impl Builder<'_> {
     /// Adds a parameter of PyTorch shape `shape`.
     pub(crate) fn weight(&self, name: &str, shape: &[usize], order: Order, init: Init) -> Result<Weight> {
         let name = self.pp(name).path;
-        if let Some((shapes, nothing)) = &self.shared.plan {
-            let mut shapes = shapes.borrow_mut();
-            if shapes.len() == MOST {
+        let mut state = self.shared.state();
+        if let Some(nothing) = &self.shared.plan {
+            if state.shapes.len() == MOST {
                 let found = format!("`{name}` after them");
                 return Err(Error::Config { what: "network", expected: "at most 65536 parameters", found });
             }
-            shapes.insert(name, shape.to_vec());
-            return Ok(Weight { tensor: nothing.clone(), train: false, graph: false, bf16: false });
+            state.shapes.insert(name, shape.to_vec());
+            return Ok(Weight {
+                tensor: nothing.clone(),
+                train: false,
+                backend: Backend::Kernels,
+                bf16: false,
+            });
         }
-        let n = shape.iter().product();
-        let data: Vec<f32> = match init {
-            Init::Uniform(b) => {
-                let mut rng = self.shared.rng.borrow_mut();
-                (0..n).map(|_| (2.0 * rng.random::<f32>() - 1.0) * b).collect()
-            }
-            Init::Ones => vec![1.0; n],
-            Init::Zeros => vec![0.0; n],
-        };
+        let data = init.draw(shape.iter().product(), &mut state.rng);
         let inner: Vec<usize> = order.map_or(shape.to_vec(), |o| o.iter().map(|a| shape[*a]).collect());
         let compute = &self.shared.compute;
-        let (graph, bf16) = (compute.through_candle(), compute.bf16());
-        let cut = order.is_some() && !graph;
+        let (backend, bf16) = (compute.backend(), compute.bf16());
+        let cut = order.is_some() && backend == Backend::Kernels;
         let data = if cut { in_panels(&data, inner.last().copied().unwrap_or(1), false) } else { data };
         let var = Var::from_vec(data, inner, compute.device())?;
         let train = self.shared.mode == Mode::Train;
         let tensor = if train { var.as_tensor().clone() } else { var.as_detached_tensor() };
         let param = Param { var, shape: shape.to_vec(), order, cut };
-        if self.shared.params.borrow_mut().insert(name.clone(), param).is_some() {
-            self.shared.duplicate.set(Some(name));
+        if state.params.insert(name.clone(), param).is_some() {
+            state.duplicate = Some(name);
         }
-        Ok(Weight { tensor, train, graph, bf16 })
+        Ok(Weight { tensor, train, backend, bf16 })
+    }
+
+    /// A tensor in PyTorch's layout for Candle's operations: the parameter `name`, made where there is none of that name
+    /// yet, as `VarBuilder` has it.
+    pub(crate) fn tensor(&self, name: &str, shape: &[usize], init: Init) -> Result<Tensor> {
+        let path = self.pp(name).path;
+        let found = match self.shared.state().params.get(&path) {
+            None => None,
+            Some(p) if p.order.is_none() && p.shape == shape => Some(p.var.as_tensor().clone()),
+            Some(p) => {
+                let expected = format!("{:?} for the parameter `{path}`", p.shape);
+                return Err(Error::Shape {
+                    what: "variable asked for again",
+                    expected,
+                    found: shape.to_vec(),
+                });
+            }
+        };
+        match (found, self.shared.mode) {
+            (Some(tensor), Mode::Train) => Ok(tensor),
+            (Some(tensor), Mode::Infer) => Ok(tensor.detach()),
+            (None, _) => {
+                let tensor = self.weight(name, shape, None, init)?.tensor;
+                // The stand-in of a plan takes its shape without taking memory.
+                Ok(if self.shared.plan.is_some() { tensor.broadcast_as(shape)? } else { tensor })
+            }
+        }
+    }
+
+    pub(crate) fn has(&self, name: &str) -> bool {
+        let (path, state) = (self.pp(name).path, self.shared.state());
+        state.params.contains_key(&path) || state.shapes.contains_key(&path)
+    }
+
+    pub(crate) fn device(&self) -> &Device {
+        self.shared.compute.device()
     }
 }
 
@@ -158,13 +244,12 @@ impl Builder<'_> {
 pub struct Params {
     params: Arc<BTreeMap<String, Param>>,
     compute: Compute,
-    /// Whether gradients and what follows them are tensors.
-    graph: bool,
+    backend: Backend,
 }
 
 impl std::fmt::Debug for Params {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_map().entries(self.params.iter().map(|(n, p)| (n, &p.shape))).finish()
+        f.debug_map().entries(self.shapes()).finish()
     }
 }
 
@@ -194,22 +279,33 @@ impl Params {
         rng: &mut ChaCha8Rng,
         f: impl FnOnce(&Builder<'_>) -> Result<T>,
     ) -> Result<(Self, T)> {
-        let shared = Shared {
-            mode,
-            compute: compute.clone(),
-            rng: RefCell::new(rng.clone()),
-            params: RefCell::default(),
-            duplicate: Cell::default(),
-            plan: None,
-        };
+        let shared = Shared::new(mode, compute, rng.clone(), None);
         let built = f(&Builder { shared: &shared, path: String::new() })?;
-        *rng = shared.rng.into_inner();
-        if let Some(name) = shared.duplicate.take() {
+        let state = shared.into_state();
+        *rng = state.rng;
+        if let Some(name) = state.duplicate {
             return Err(Error::Duplicate(name));
         }
-        let graph = compute.through_candle();
-        let params = Arc::new(shared.params.into_inner());
-        Ok((Self { params, compute: shared.compute, graph }, built))
+        Ok((Self::of(state.params, compute), built))
+    }
+
+    fn of(params: BTreeMap<String, Param>, compute: &Compute) -> Self {
+        Self { params: Arc::new(params), compute: compute.clone(), backend: compute.backend() }
+    }
+
+    /// `vars` themselves as parameters, all on one device and of `f32`.
+    pub(crate) fn of_vars(vars: BTreeMap<String, Var>) -> Result<Self> {
+        let device = vars.values().next().map_or(Device::Cpu, |v| v.device().clone());
+        for (name, var) in &vars {
+            if var.dtype() != DType::F32 || !var.is_contiguous() || !var.device().same_device(&device) {
+                let found = format!("`{name}` of {:?} on {:?}", var.dtype(), var.device().location());
+                let expected = "contiguous f32, all on one device";
+                return Err(Error::Config { what: "variables", expected, found });
+            }
+        }
+        let param = |var: Var| Param { shape: var.dims().to_vec(), var, order: None, cut: false };
+        let params = vars.into_iter().map(|(name, var)| (name, param(var))).collect();
+        Ok(Self::of(params, &Compute::of(&device)))
     }
 
     /// Checks that the network which `f` builds has these weights, before there is memory for it: a file may describe a
@@ -224,16 +320,9 @@ impl Params {
     fn shapes_of<T>(f: impl FnOnce(&Builder<'_>) -> Result<T>) -> Result<Shapes> {
         let compute = Compute::cpu();
         let nothing = Tensor::zeros((), DType::F32, compute.device())?;
-        let shared = Shared {
-            mode: Mode::Infer,
-            compute,
-            rng: RefCell::new(ChaCha8Rng::seed_from_u64(0)),
-            params: RefCell::default(),
-            duplicate: Cell::default(),
-            plan: Some((RefCell::default(), nothing)),
-        };
+        let shared = Shared::new(Mode::Infer, &compute, ChaCha8Rng::seed_from_u64(0), Some(nothing));
         f(&Builder { shared: &shared, path: String::new() })?;
-        Ok(shared.plan.map(|(shapes, _)| shapes.into_inner()).unwrap_or_default())
+        Ok(shared.into_state().shapes)
     }
 
     /// How many numbers the parameters that `f` asks for would be, without taking the memory for them.
@@ -255,12 +344,11 @@ impl Params {
     pub fn is_on(&self, compute: &Compute) -> bool {
         self.compute.device().same_device(compute.device())
             && self.compute.bf16() == compute.bf16()
-            && self.graph == compute.through_candle()
+            && self.backend == compute.backend()
     }
 
-    /// Whether gradients and what follows them are tensors.
-    pub(crate) fn in_graph(&self) -> bool {
-        self.graph
+    pub(crate) fn backend(&self) -> Backend {
+        self.backend
     }
 
     /// All parameters in PyTorch's layout.
@@ -270,7 +358,7 @@ impl Params {
     pub fn export(&self) -> Result<Weights> {
         let mut out = Weights::new();
         for (name, p) in self.params.iter() {
-            let tensor = if self.graph {
+            let tensor = if self.backend == Backend::Candle {
                 p.outward(&host(p.var.as_tensor())?)
             } else {
                 with(p.var.as_tensor(), |d| p.outward(d))?
@@ -288,7 +376,7 @@ impl Params {
         self.matches(weights)?;
         for (param, tensor) in self.params.values().zip(weights.values()) {
             let data = param.inward(&tensor.data);
-            if self.graph {
+            if self.backend == Backend::Candle {
                 param.var.set(&Tensor::from_vec(data, param.var.shape(), param.var.device())?)?;
             } else {
                 edit(&param.var, |p| p.copy_from_slice(&data))?;
@@ -320,9 +408,14 @@ impl Params {
         self.params.keys().map(String::as_str)
     }
 
+    /// Names and PyTorch's shapes, sorted by name.
+    pub(crate) fn shapes(&self) -> impl Iterator<Item = (&String, &Vec<usize>)> {
+        self.params.iter().map(|(n, p)| (n, &p.shape))
+    }
+
     /// Fails with the list of differences unless `weights` has these names and shapes.
     pub(crate) fn matches(&self, weights: &Weights) -> Result<()> {
-        fit(self.params.iter().map(|(n, p)| (n, &p.shape)), weights)
+        fit(self.shapes(), weights)
     }
 
     pub(crate) fn variables(&self) -> impl Iterator<Item = &Var> {
@@ -339,7 +432,7 @@ impl Params {
     pub(crate) fn all_inward(&self, weights: &Weights) -> Result<Vec<Numbers>> {
         self.matches(weights)?;
         let each = self.params.values().zip(weights.values());
-        each.map(|(p, t)| Numbers::new(p.inward(&t.data), &p.var, self.graph)).collect()
+        each.map(|(p, t)| Numbers::new(p.inward(&t.data), &p.var, self.backend)).collect()
     }
 }
 
@@ -394,50 +487,4 @@ fn permute_axes(data: &[f32], shape: &[usize], order: &[usize], inward: bool) ->
         }
     }
     out
-}
-
-/// The numbers of a contiguous host tensor of `f32`.
-pub(crate) fn slice<'a>(storage: &'a Storage, layout: &Layout) -> Result<&'a [f32]> {
-    match (storage, layout.contiguous_offsets()) {
-        (Storage::Cpu(CpuStorage::F32(v)), Some((a, b))) => Ok(&v[a..b]),
-        _ => Err(Error::Config {
-            what: "tensor",
-            expected: "contiguous f32 on the CPU",
-            found: format!("{:?} of {layout:?}", storage.dtype()),
-        }),
-    }
-}
-
-/// The numbers of a tensor, wherever it is.
-pub(crate) fn host(tensor: &Tensor) -> Result<Vec<f32>> {
-    Ok(tensor.flatten_all()?.to_vec1()?)
-}
-
-/// Runs `f` on the numbers of a contiguous tensor.
-pub(crate) fn with<R>(tensor: &Tensor, f: impl FnOnce(&[f32]) -> R) -> Result<R> {
-    let (storage, layout) = tensor.storage_and_layout();
-    Ok(f(slice(&storage, layout)?))
-}
-
-struct Edit<F>(RefCell<Option<F>>);
-
-impl<F: FnOnce(&mut [f32])> InplaceOp1 for Edit<F> {
-    fn name(&self) -> &'static str {
-        "edit"
-    }
-
-    fn cpu_fwd(&self, storage: &mut CpuStorage, layout: &Layout) -> candle_core::Result<()> {
-        let (CpuStorage::F32(v), Some((a, b))) = (storage, layout.contiguous_offsets()) else {
-            candle_core::bail!("expected a contiguous variable of f32");
-        };
-        if let Some(f) = self.0.take() {
-            f(&mut v[a..b]);
-        }
-        Ok(())
-    }
-}
-
-/// Changes a variable in place.
-pub(crate) fn edit(var: &Var, f: impl FnOnce(&mut [f32])) -> Result<()> {
-    Ok(var.as_tensor().inplace_op1(&Edit(RefCell::new(Some(f))))?)
 }

@@ -6,13 +6,14 @@
 //!
 //! On other devices nothing is recorded: values are tensors that Candle tracks, see [`crate::graph`].
 
-use crate::compute::through_candle;
+use crate::compute::Backend;
 use crate::grad;
 use crate::kernel::add_assign;
-use crate::params::{Weight, slice};
+use crate::params::Weight;
+use crate::storage::slice;
 use crate::{Error, Result};
 use candle_core::{
-    CpuStorage, CustomOp1, CustomOp2, CustomOp3, Device, Layout, Shape, StorageRef, Tensor, TensorId,
+    CpuStorage, CustomOp1, CustomOp2, CustomOp3, DType, Device, Layout, Shape, StorageRef, Tensor, TensorId,
 };
 use std::ops::Deref;
 use std::sync::Mutex;
@@ -47,7 +48,7 @@ pub(crate) struct Tape {
     slots: Vec<Slot>,
     steps: Vec<(Node, Box<dyn Step>)>,
     record: bool,
-    graph: bool,
+    backend: Backend,
 }
 
 /// The numbers of a value, wherever they live.
@@ -94,7 +95,7 @@ impl Tape {
 
     /// Whether layers are to compute with Candle's operations, on [`Tape::tensor`] and [`Tape::put`].
     pub(crate) fn in_graph(&self) -> bool {
-        self.graph
+        self.backend == Backend::Candle
     }
 
     /// A value as Candle sees it.
@@ -217,9 +218,11 @@ impl Whole {
         let mut grads = flow.grads;
         let mut out = [None, None, None];
         for (o, n) in out.iter_mut().zip(&self.tracked) {
-            if let Some(g) = grads[n.0].take() {
-                *o = Some(Tensor::from_vec(g, tape.shape(*n), &Device::Cpu)?);
-            }
+            // Candle panics where what lies before an input gets no gradient.
+            *o = Some(match grads[n.0].take() {
+                Some(g) => Tensor::from_vec(g, tape.shape(*n), &Device::Cpu)?,
+                None => Tensor::zeros(tape.shape(*n), DType::F32, &Device::Cpu)?,
+            });
         }
         Ok(out)
     }
@@ -322,9 +325,9 @@ pub(crate) fn run(
 ) -> Result<Tensor> {
     let anchor = weight.filter(|w| w.train).map(|w| &w.tensor);
     let record = grad::enabled() && (anchor.is_some() || inputs.iter().any(|t| t.track_op()));
-    let graph = weight.map_or_else(|| through_candle(inputs), |w| w.graph);
-    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record, graph };
-    if graph {
+    let backend = weight.map_or_else(|| Backend::of(inputs), |w| w.backend);
+    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record, backend };
+    if backend == Backend::Candle {
         return run_tracked(tape, inputs, weight, f);
     }
     let mut nodes = Vec::with_capacity(inputs.len());

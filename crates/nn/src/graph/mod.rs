@@ -11,29 +11,39 @@ pub(crate) mod norm;
 pub(crate) mod optim;
 pub(crate) mod pool;
 
+use crate::Error;
+use crate::grad::enabled;
 use candle_core::backend::BackendStorage;
 use candle_core::{
     CpuStorage, CudaStorage, CustomOp1, CustomOp2, CustomOp3, DType, Layout, Result, Shape, Storage, Tensor,
 };
 use std::sync::Mutex;
 
-/// What a backward pass is given.
-pub(crate) struct Given<'a> {
+/// What the backward pass of [`with_gradient`] is given.
+pub struct Given<'a> {
     arguments: Vec<&'a Tensor>,
     result: &'a Tensor,
 }
 
 impl Given<'_> {
     /// Argument number `i`, untracked.
-    fn argument(&self, i: usize) -> Tensor {
+    ///
+    /// # Panics
+    /// When there is none of that number.
+    #[must_use]
+    pub fn argument(&self, i: usize) -> Tensor {
         self.arguments[i].detach()
     }
     /// The result, untracked.
-    fn result(&self) -> Tensor {
+    #[must_use]
+    pub fn result(&self) -> Tensor {
         self.result.detach()
     }
-    /// The gradient of argument `i`, if it is wanted. Candle panics where a wanted one is missing.
-    fn gradient(&self, i: usize, f: impl FnOnce() -> Result<Tensor>) -> Result<Option<Tensor>> {
+    /// The gradient of argument `i`, if it is wanted: what `f` returns, in the shape of the argument.
+    ///
+    /// # Errors
+    /// What `f` returns, and Candle's where the number of elements is another.
+    pub fn gradient(&self, i: usize, f: impl FnOnce() -> Result<Tensor>) -> Result<Option<Tensor>> {
         match self.arguments.get(i) {
             Some(a) if a.track_op() => Ok(Some(f()?.reshape(a.dims())?)),
             _ => Ok(None),
@@ -41,7 +51,8 @@ impl Given<'_> {
     }
 }
 
-type Gradients = [Option<Tensor>; 3];
+/// The gradients of up to three arguments, of their shapes; [`Given::gradient`] makes each.
+pub type Gradients = [Option<Tensor>; 3];
 
 /// A value with a gradient of its own.
 struct Formula<F> {
@@ -50,12 +61,46 @@ struct Formula<F> {
     back: F,
 }
 
-/// `value`, which was computed from `arguments` (at most three), with `back` for its gradient.
-fn with_gradient<F>(value: Tensor, arguments: &[&Tensor], back: F) -> Result<Tensor>
+/// `value`, which was computed from `arguments`, with `back` for its gradient: a layer of your own, on any device.
+///
+/// Its inputs and its weights are arguments alike; [`crate::Builder::var_builder`] makes weights. `back` turns the gradient of
+/// the result, contiguous and of its shape, into those of the arguments. The layers here are made so wherever they do not run
+/// on this crate's kernels.
+///
+/// # Shapes
+/// One to three arguments of any shape; `value` of any shape.
+///
+/// # Errors
+/// Candle's, when `value` was computed from tracked tensors (detach the arguments first: what is tracked and no argument would
+/// get no gradient), or when there are no or too many arguments. The backward pass fails when `back` returns no gradient for an
+/// argument that wants one, or one of another shape.
+///
+/// ```
+/// use e2h_nn::candle_core::{Device, Result, Tensor, Var};
+/// use e2h_nn::with_gradient;
+///
+/// /// x^3, with 3 x^2 for its gradient.
+/// fn cube(x: &Tensor) -> Result<Tensor> {
+///     with_gradient(x.detach().powf(3.0)?, &[x], |given, dy| {
+///         let dx = given.gradient(0, || dy * (given.argument(0).sqr()? * 3.0)?)?;
+///         Ok([dx, None, None])
+///     })
+/// }
+///
+/// let x = Var::new(&[2f32, -1.], &Device::Cpu)?;
+/// let grads = cube(&x)?.sum_all()?.backward()?;
+/// assert_eq!(grads.get(&x).unwrap().to_vec1::<f32>()?, [12.0, 3.0]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+pub fn with_gradient<F>(value: Tensor, arguments: &[&Tensor], back: F) -> Result<Tensor>
 where
     F: Fn(&Given<'_>, &Tensor) -> Result<Gradients> + Send + Sync + 'static,
 {
-    if !arguments.iter().any(|a| a.track_op()) {
+    if value.track_op() {
+        let (what, expected) = ("value with a gradient of its own", "one computed from detached tensors");
+        return Err(Error::Config { what, expected, found: "a tracked one".into() }.into());
+    }
+    if !enabled() || !arguments.iter().any(|a| a.track_op()) {
         return Ok(value);
     }
     let whole = value.is_contiguous() && value.layout().start_offset() == 0;
@@ -94,7 +139,18 @@ where
         }
     }
     fn gradients(&self, arguments: Vec<&Tensor>, result: &Tensor, dy: &Tensor) -> Result<Gradients> {
-        (self.back)(&Given { arguments, result }, &dy.detach().contiguous()?)
+        let given = Given { arguments, result };
+        let gradients = (self.back)(&given, &dy.detach().contiguous()?)?;
+        for (i, (a, g)) in given.arguments.iter().zip(&gradients).enumerate() {
+            // Candle would panic.
+            let found = g.as_ref().map(Tensor::dims);
+            if found.is_some_and(|d| d != a.dims()) || found.is_none() && a.track_op() {
+                let expected = format!("{:?} for argument {i}", a.dims());
+                let found = found.unwrap_or_default().to_vec();
+                return Err(Error::Shape { what: "gradient", expected, found }.into());
+            }
+        }
+        Ok(gradients)
     }
 }
 

@@ -81,7 +81,7 @@ impl Conv1d {
         builder: &Builder<'_>,
     ) -> Result<Self> {
         positive("conv1d channels, kernel and stride", &[from, to, kernel, stride])?;
-        let bound = Init::Uniform(1.0 / ((from * kernel) as f32).sqrt());
+        let bound = Init::within(1.0 / ((from * kernel) as f32).sqrt());
         let weight = builder.weight("weight", &[to, from, kernel], Some(&[2, 1, 0]), bound)?;
         let bias = builder.weight("bias", &[to], None, bound)?;
         Ok(Self { weight, bias, from, to, kernel, stride, padding })
@@ -144,7 +144,7 @@ impl Conv2d {
     ) -> Result<Self> {
         let (from, to) = channels;
         positive("conv2d channels, kernel and stride", &[from, to, kernel, stride])?;
-        let bound = Init::Uniform(1.0 / ((from * kernel * kernel) as f32).sqrt());
+        let bound = Init::within(1.0 / ((from * kernel * kernel) as f32).sqrt());
         let weight = builder.weight("weight", &[to, from, kernel, kernel], Some(&[2, 3, 1, 0]), bound)?;
         let bias = bias.then(|| builder.weight("bias", &[to], None, bound)).transpose()?;
         Ok(Self { weight, bias, from, to, kernel, stride, padding })
@@ -203,7 +203,7 @@ impl ConvTranspose1d {
     pub fn new(from: usize, to: usize, builder: &Builder<'_>) -> Result<Self> {
         positive("transposed convolution channels", &[from, to])?;
         // PyTorch takes the second axis of the weight for its fan in.
-        let bound = Init::Uniform(1.0 / ((to * Self::KERNEL) as f32).sqrt());
+        let bound = Init::within(1.0 / ((to * Self::KERNEL) as f32).sqrt());
         let weight = builder.weight("weight", &[from, to, Self::KERNEL], Some(&[2, 0, 1]), bound)?;
         Ok(Self { weight, bias: builder.weight("bias", &[to], None, bound)?, from, to })
     }

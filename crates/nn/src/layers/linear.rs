@@ -24,7 +24,7 @@ impl Linear {
             let found = format!("{from} to {to}");
             return Err(Error::Config { what: "linear layer", expected: "positive sizes", found });
         }
-        let bound = Init::Uniform(1.0 / (from as f32).sqrt());
+        let bound = Init::within(1.0 / (from as f32).sqrt());
         let weight = builder.weight("weight", &[to, from], Some(&[1, 0]), bound)?;
         Ok(Self { weight, bias: builder.weight("bias", &[to], None, bound)?, from, to })
     }

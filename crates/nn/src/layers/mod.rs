@@ -3,6 +3,7 @@
 mod conv;
 mod elementwise;
 mod linear;
+mod module;
 mod norm;
 mod pool;
 

@@ -56,10 +56,10 @@ impl GroupNorm {
                 found,
             });
         }
-        let gain = builder.weight("weight", &[channels], None, Init::Ones)?;
+        let gain = builder.weight("weight", &[channels], None, Init::Constant(1.0))?;
         Ok(Self {
             gain,
-            bias: builder.weight("bias", &[channels], None, Init::Zeros)?,
+            bias: builder.weight("bias", &[channels], None, Init::Constant(0.0))?,
             groups,
             channels,
             act,

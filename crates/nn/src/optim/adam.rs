@@ -2,7 +2,8 @@ use crate::grad::Grads;
 use crate::graph;
 use crate::kernel::optim;
 use crate::numbers::{Numbers, elsewhere};
-use crate::params::{Params, edit};
+use crate::params::Params;
+use crate::storage::edit;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
 
@@ -97,7 +98,7 @@ impl Adam {
     pub fn new(config: &AdamConfig, params: &Params) -> Result<Self> {
         config.validate()?;
         let zeros: Result<Vec<Numbers>> =
-            params.variables().map(|v| Numbers::zeros(v, params.in_graph())).collect();
+            params.variables().map(|v| Numbers::zeros(v, params.backend())).collect();
         let mean = zeros?;
         Ok(Self { config: *config, params: params.clone(), square: mean.clone(), mean, steps: 0 })
     }

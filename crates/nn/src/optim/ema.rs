@@ -1,7 +1,9 @@
+use crate::compute::Backend;
 use crate::graph;
 use crate::kernel::optim;
 use crate::numbers::{Numbers, elsewhere};
-use crate::params::{Params, with};
+use crate::params::Params;
+use crate::storage::with;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};
 
@@ -66,7 +68,7 @@ impl Ema {
     /// [`Error::Config`] when a setting does not work; [`Error::Candle`] when a variable cannot be read.
     pub fn new(config: &EmaConfig, params: &Params) -> Result<Self> {
         config.validate()?;
-        let average: Result<_> = params.variables().map(|v| Numbers::copy(v, params.in_graph())).collect();
+        let average: Result<_> = params.variables().map(|v| Numbers::copy(v, params.backend())).collect();
         Ok(Self { config: *config, params: params.clone(), average: average?, updates: 0 })
     }
 
@@ -84,13 +86,15 @@ impl Ema {
         let part = (1.0 - self.config.decay(self.updates)) as f32;
         for (var, a) in params.variables().zip(&mut self.average) {
             match a {
-                Numbers::Host(a) if !params.in_graph() => with(var.as_tensor(), |p| {
+                Numbers::Host(a) if params.backend() == Backend::Kernels => with(var.as_tensor(), |p| {
                     if part < 1.0 { optim::blend(a, p, part) } else { a.copy_from_slice(p) }
                 })?,
-                Numbers::Device(a) if params.in_graph() && part < 1.0 => {
+                Numbers::Device(a) if params.backend() == Backend::Candle && part < 1.0 => {
                     *a = graph::optim::blend(a, &var.as_detached_tensor(), part)?;
                 }
-                a @ Numbers::Device(_) if params.in_graph() => *a = Numbers::copy(var, true)?,
+                a @ Numbers::Device(_) if params.backend() == Backend::Candle => {
+                    *a = Numbers::copy(var, Backend::Candle)?;
+                }
                 _ => return Err(elsewhere("moving average", params.len())),
             }
         }

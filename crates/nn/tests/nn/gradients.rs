@@ -427,3 +427,21 @@ fn candle_backward_is_refused() {
     let _ = fill(&Weights::new());
     assert!(loss(&net.forward(&x(1, &[3, 4])).unwrap()).backward().is_err());
 }
+
+/// Candle panics where a tracked value with a past gets no gradient.
+#[test]
+fn an_unused_input_gets_zeros() {
+    let config = UnetConfig {
+        input_dim: 2,
+        down_dims: vec![8],
+        kernel_size: 3,
+        n_groups: 2,
+        step_embed_dim: 4,
+        cond_dim: 0,
+    };
+    let (params, net) = filled(Mode::Train, |b| ConditionalUnet1d::new(&config, b));
+    let x = Var::from_tensor(&input(1, &[2, 4, 2], 1.0, 0.0)).unwrap();
+    let cond = (Var::from_tensor(&input(2, &[2, 0], 1.0, 0.0)).unwrap().as_tensor() * 2.0).unwrap();
+    let out = net.forward(&(x.as_tensor() * 2.0).unwrap(), &[1.0, 2.0], &cond).unwrap();
+    assert_eq!(backward(&loss(&out), &params).unwrap().export(&params).unwrap().len(), params.len());
+}

@@ -1,5 +1,6 @@
 use crate::{ACTION_DIM, Error, Pose, Result, STATE_DIM};
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// One state row. Units: metres, unit quaternions (wxyz), metres of gripper opening.
 pub type State = [f32; STATE_DIM];
@@ -139,7 +140,13 @@ pub struct Observation {
     pub frames: Vec<Image>,
 }
 
-/// All images of one camera over an episode. Shapes: `data` is (T, height, width, 3).
+/// The images of one camera over an episode, one a row.
+///
+/// An image is shared by all episodes that show it: cloning an episode or selecting rows of it copies no pixel, and an image
+/// is freed with the last episode that shows it.
+///
+/// # Shapes
+/// `images` (T), each (height, width, 3), row-major, 8 bits a channel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Frames {
     /// Camera name.
@@ -148,16 +155,35 @@ pub struct Frames {
     pub height: usize,
     /// Columns.
     pub width: usize,
-    /// RGB bytes of all images, one after the other.
-    pub data: Vec<u8>,
+    /// RGB bytes of each row's image.
+    pub images: Vec<Arc<[u8]>>,
 }
 
 impl Frames {
+    /// Images from the bytes of all of them, one after the other. What is left over at the end becomes an image too short,
+    /// which [`Episode::validate`] refuses.
+    ///
+    /// # Shapes
+    /// `bytes` is (T, height, width, 3).
+    #[must_use]
+    pub fn new(camera: &str, height: usize, width: usize, bytes: &[u8]) -> Self {
+        let images = bytes.chunks((height * width * 3).max(1)).map(Arc::from).collect();
+        Self { camera: camera.to_owned(), height, width, images }
+    }
+
     /// Bytes of image `row`; empty when there is no such row.
     #[must_use]
     pub fn image(&self, row: usize) -> &[u8] {
-        let n = self.height * self.width * 3;
-        self.data.get(row * n..(row + 1) * n).unwrap_or(&[])
+        self.images.get(row).map_or(&[], |image| image)
+    }
+
+    /// A copy of all images, one after the other: what [`Frames::new`] takes.
+    ///
+    /// # Shapes
+    /// The result is (T, height, width, 3).
+    #[must_use]
+    pub fn to_bytes(&self) -> Vec<u8> {
+        self.images.concat()
     }
 }
 
@@ -194,10 +220,7 @@ impl Episode {
         Self {
             state: vec![],
             action: vec![],
-            frames: cameras
-                .iter()
-                .map(|camera| Frames { camera: camera.clone(), height: 0, width: 0, data: vec![] })
-                .collect(),
+            frames: cameras.iter().map(|camera| Frames::new(camera, 0, 0, &[])).collect(),
             source: vec![],
             excursion: vec![],
             outcome: Outcome::Timeout,
@@ -237,7 +260,7 @@ impl Episode {
                     found: (image.height, image.width),
                 });
             }
-            column.data.extend_from_slice(&image.data);
+            column.images.push(image.data.as_slice().into());
         }
         #[allow(clippy::cast_possible_truncation, reason = "episodes are far shorter than 2^32 rows")]
         self.source.push(self.state.len() as u32);
@@ -247,7 +270,8 @@ impl Episode {
         Ok(())
     }
 
-    /// The rows `rows` in that order, as a new episode; poses and images are copied, never blended.
+    /// The rows `rows` in that order, as a new episode. Numbers are copied, images are shared with this episode (see
+    /// [`Frames`]); nothing is blended.
     /// Rows outside the episode are left out. `terminal` is kept only when the last row is taken last.
     #[must_use]
     pub fn select(&self, rows: &[usize]) -> Self {
@@ -260,9 +284,8 @@ impl Episode {
                 .iter()
                 .map(|f| Frames {
                     camera: f.camera.clone(),
-                    height: f.height,
-                    width: f.width,
-                    data: rows.iter().map(|&r| f.image(r)).collect::<Vec<_>>().concat(),
+                    images: rows.iter().filter_map(|&r| f.images.get(r).cloned()).collect(),
+                    ..*f
                 })
                 .collect(),
             source: rows.iter().map(|&r| self.source[r]).collect(),
@@ -285,7 +308,7 @@ impl Episode {
         self.state[t][STATE_DIM - 1]
     }
 
-    /// Checks that columns agree in length and all numbers are finite.
+    /// Checks that columns agree in length, images have the size of their camera and all numbers are finite.
     ///
     /// # Errors
     /// Names the first column that does not fit.
@@ -301,8 +324,12 @@ impl Episode {
         rows("source", self.source.len())?;
         rows("excursion", self.excursion.len())?;
         for f in &self.frames {
-            let n = (f.height * f.width * 3).max(1);
-            rows(&f.camera, if f.data.len() % n == 0 { f.data.len() / n } else { usize::MAX })?;
+            rows(&f.camera, f.images.len())?;
+            let expected = f.height * f.width * 3;
+            if let Some(row) = f.images.iter().position(|image| image.len() != expected) {
+                let (camera, found) = (f.camera.clone(), f.image(row).len());
+                return Err(Error::ImageBytes { camera, row, expected, found });
+            }
         }
         let finite = |column, row, values: &[f32]| {
             if values.iter().all(|v| v.is_finite()) { Ok(()) } else { Err(Error::NotFinite { column, row }) }
@@ -334,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn select_copies_rows_in_order_and_keeps_their_source() {
+    fn select_takes_rows_in_order_and_keeps_their_source() {
         let e = episode(5);
         let s = e.select(&[4, 1, 9]);
         assert_eq!(s.source, [4, 1]);
@@ -342,6 +369,28 @@ mod tests {
         assert!(!s.terminal);
         assert!(e.select(&[0, 4]).terminal);
         s.validate().unwrap();
+    }
+
+    #[test]
+    fn images_are_shared_and_outlive_the_episode_that_they_came_with() {
+        let e = episode(5);
+        let s = e.select(&[3, 0]).select(&[1]);
+        assert!(Arc::ptr_eq(&s.frames[0].images[0], &e.frames[0].images[0]));
+        drop(e);
+        assert_eq!(Arc::strong_count(&s.frames[0].images[0]), 1);
+        assert_eq!(s.frames[0].image(0), &[0; 12]);
+    }
+
+    #[test]
+    fn images_of_another_size_are_refused_by_row() {
+        let mut e = episode(3);
+        let bytes = e.frames[0].to_bytes();
+        assert_eq!(Frames::new("table", 2, 2, &bytes), e.frames[0]);
+        e.frames[0] = Frames::new("table", 2, 2, &bytes[..35]);
+        let message = e.validate().unwrap_err().to_string();
+        assert_eq!(message, "camera `table`, row 2: expected an image of 12 bytes, got 11");
+        e.frames[0] = Frames::new("table", 2, 2, &bytes[..24]);
+        assert!(matches!(e.validate(), Err(Error::Rows { expected: 3, found: 2, .. })));
     }
 
     #[test]

@@ -58,6 +58,18 @@ pub enum Error {
         /// Height and width of the offending image.
         found: (usize, usize),
     },
+    /// An image has more or fewer bytes than its camera's height, width and three channels make.
+    #[error("camera `{camera}`, row {row}: expected an image of {expected} bytes, got {found}")]
+    ImageBytes {
+        /// Name of the camera.
+        camera: String,
+        /// Row index.
+        row: usize,
+        /// Bytes of an image of this camera.
+        expected: usize,
+        /// Bytes of the image.
+        found: usize,
+    },
     /// Columns of an episode differ in length.
     #[error("episode column `{column}`: expected {expected} rows, got {found}")]
     Rows {

@@ -48,8 +48,8 @@ fn episode(index: usize, rows: usize) -> Result<Episode> {
     }
     for (camera, height, width) in [("table", 48, 64), ("wrist", 240, 320)] {
         let pixel = |i: usize| (i * 31 + (i / 3 % width) * 5 + index * 17) as u8;
-        let data = (0..rows * height * width * 3).map(pixel).collect();
-        e.frames.push(Frames { camera: camera.to_owned(), height, width, data });
+        let bytes: Vec<u8> = (0..rows * height * width * 3).map(pixel).collect();
+        e.frames.push(Frames::new(camera, height, width, &bytes));
     }
     e.origin.reversed = index == 3;
     e.outcome = if index == 1 { Outcome::Timeout } else { Outcome::Success { at: rows - 1 } };

@@ -46,9 +46,10 @@ pub(crate) fn encode(episode: &Episode, path: &Path) -> Result<Vec<u8>> {
     if episode.excursion.iter().flatten().any(|&v| v != 0.0) {
         tensors.push(("excursion".to_owned(), view(Dtype::F32, vec![rows, 4], &excursion)?));
     }
-    for f in &episode.frames {
+    let images: Vec<Vec<u8>> = episode.frames.iter().map(Frames::to_bytes).collect();
+    for (f, images) in episode.frames.iter().zip(&images) {
         let shape = vec![rows, f.height, f.width, 3];
-        tensors.push((format!("frames.{}", f.camera), view(Dtype::U8, shape, &f.data)?));
+        tensors.push((format!("frames.{}", f.camera), view(Dtype::U8, shape, images)?));
     }
     let header = Header {
         format: FORMAT,
@@ -142,7 +143,7 @@ pub(crate) fn decode(bytes: &[u8], path: &Path) -> Result<Episode> {
     let camera = |camera: &String| {
         let view = tensor(&format!("frames.{camera}"))?;
         let (height, width) = (view.shape()[1], view.shape()[2]);
-        Ok(Frames { camera: camera.clone(), height, width, data: view.data().to_vec() })
+        Ok(Frames::new(camera, height, width, view.data()))
     };
     let episode = Episode {
         state: rows(tensor("state")?.data()),

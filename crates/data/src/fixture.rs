@@ -9,11 +9,9 @@ pub(crate) fn episode(rows: usize) -> Episode {
         let state = std::array::from_fn(|i| t as f32 + 0.01 * i as f32);
         e.push(&Observation { state, frames: vec![] }, &[t as f32; 8]).unwrap();
     }
-    let camera = |name: &str, height: usize, width: usize| Frames {
-        camera: name.to_owned(),
-        height,
-        width,
-        data: (0..rows * height * width * 3).map(|i| i as u8).collect(),
+    let camera = |name: &str, height: usize, width: usize| {
+        let bytes: Vec<u8> = (0..rows * height * width * 3).map(|i| i as u8).collect();
+        Frames::new(name, height, width, &bytes)
     };
     e.frames = vec![camera("wrist", 2, 3), camera("table", 4, 4)];
     e.outcome = Outcome::Success { at: rows / 2 };

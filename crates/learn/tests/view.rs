@@ -111,10 +111,10 @@ fn episode(index: u32, rows: usize, side: usize) -> Episode {
             let near = x.abs_diff((t + index as usize) % side) < 3 && y.abs_diff(side / 2) < 3;
             if near { [230, 120, 40] } else { [60, (70 + y) as u8, (90 + x) as u8] }
         };
-        let data = (0..rows * side * side)
+        let bytes: Vec<u8> = (0..rows * side * side)
             .flat_map(|i| pixel(i / (side * side), i / side % side, i % side))
             .collect();
-        e.frames.push(Frames { camera: camera.to_owned(), height: side, width: side, data });
+        e.frames.push(Frames::new(camera, side, side, &bytes));
     }
     e.outcome = if index % 3 == 2 { Outcome::Timeout } else { Outcome::Success { at: rows - 1 } };
     e

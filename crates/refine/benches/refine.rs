@@ -1,8 +1,11 @@
-//! Frames a second that refinement passes without a critic: reversal and the kinematic filter.
+//! Frames per second that refinement passes: reversal and the kinematic filter, and with the critic's filters after them. The
+//! critic's own time is not in it: values are given.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use e2h_core::{Direction, Episode, Frames, Observation, Origin};
-use e2h_refine::{KinematicConfig, ReverseConfig, kinematic_filter, reverse};
+use e2h_refine::{
+    AdvantageConfig, KinematicConfig, ReverseConfig, SuffixConfig, critic_filter, kinematic_filter, reverse,
+};
 use std::hint::black_box;
 
 const ROWS: usize = 300;
@@ -22,12 +25,7 @@ fn episode(side: usize) -> Episode {
         }
     }
     if side > 0 {
-        let camera = |name: &str| Frames {
-            camera: name.to_owned(),
-            height: side,
-            width: side,
-            data: vec![7; ROWS * side * side * 3],
-        };
+        let camera = |name: &str| Frames::new(name, side, side, &vec![7; ROWS * side * side * 3]);
         episode.frames = vec![camera("table"), camera("wrist")];
     }
     episode
@@ -46,6 +44,15 @@ fn bench(c: &mut Criterion) {
                 b.iter(|| kinematic_filter(&reverse(black_box(&easy), &reversal), kinematic, &reversal));
             });
         }
+        let (suffix, advantage) = (SuffixConfig::default(), AdvantageConfig::default());
+        group.bench_function(format!("laptop with values, {images}"), |b| {
+            b.iter(|| {
+                let first = kinematic_filter(&reverse(black_box(&easy), &reversal), &laptop, &reversal);
+                let rise = |rows: usize| (0..rows).map(|t| (0.1 * t as f32).sin()).collect();
+                let values: Vec<Vec<f32>> = first.segments.iter().map(|s| rise(s.len())).collect();
+                critic_filter(vec![first], &values, &suffix, &advantage)
+            });
+        });
     }
     group.finish();
 }

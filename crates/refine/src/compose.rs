@@ -1,22 +1,5 @@
-use crate::{
-    AdvantageConfig, Error, KinematicConfig, Refined, Result, ReverseConfig, SuffixConfig, advantage_filter,
-    cut_suffix, kinematic_filter,
-};
+use crate::{AdvantageConfig, Error, Refined, Result, SuffixConfig, advantage_filter, cut_suffix};
 use e2h_core::Episode;
-use std::borrow::Borrow;
-
-/// The kinematic filter over many reversed recordings, one result each.
-///
-/// # Source
-/// Eq. 6, the inner stage.
-#[must_use]
-pub fn refine_reversed<E: Borrow<Episode>>(
-    reversed: &[E],
-    kinematic: &KinematicConfig,
-    reverse: &ReverseConfig,
-) -> Vec<Refined> {
-    reversed.iter().map(|e| kinematic_filter(e.borrow(), kinematic, reverse)).collect()
-}
 
 /// What the critic leaves of what an earlier stage left: suffixes cut where that is on, then the advantage filter over all
 /// frames of the iteration. Fates of the results belong to the frames that the earlier stage was given.

@@ -11,8 +11,8 @@ pub(crate) fn along(x: &[f64]) -> Episode {
         (state[0], state[4], state[7], state[10], state[14]) = (x as f32, 1.0, 0.5, 1.0, 0.08);
         episode.push(&Observation { state, frames: vec![] }, &[9.0; 8]).unwrap();
     }
-    let data = (0..x.len()).flat_map(|t| [t as u8; 3]).collect();
-    episode.frames = vec![Frames { camera: "table".into(), height: 1, width: 1, data }];
+    let bytes: Vec<u8> = (0..x.len()).flat_map(|t| [t as u8; 3]).collect();
+    episode.frames = vec![Frames::new("table", 1, 1, &bytes)];
     episode.validate().unwrap();
     episode
 }

@@ -43,7 +43,7 @@ mod still;
 mod suffix;
 
 pub use advantage::{AdvantageConfig, advantage_filter, advantages};
-pub use compose::{critic_filter, refine_reversed};
+pub use compose::critic_filter;
 pub use error::{Error, Result};
 pub use fate::{Fate, RefineReport, Refined, merge_fates};
 pub use goal::{Goal, GoalConfig};

@@ -5,7 +5,7 @@
 use e2h_core::{Direction, Episode, Frames, Observation, Origin};
 use e2h_refine::{
     AdvantageConfig, Fate, KinematicConfig, RefineReport, Refined, ReverseConfig, SuffixConfig,
-    critic_filter, kinematic_filter, merge_fates, refine_reversed, reverse,
+    critic_filter, kinematic_filter, merge_fates, reverse,
 };
 use proptest::prelude::*;
 
@@ -33,8 +33,8 @@ fn episodes() -> impl Strategy<Value = Episode> {
                 episode.push(&Observation { state, frames: vec![] }, &[0.0; 8]).unwrap();
             }
         }
-        let data = (0..episode.len()).flat_map(|t| [(t % 251) as u8; 3]).collect();
-        episode.frames = vec![Frames { camera: "table".into(), height: 1, width: 1, data }];
+        let bytes: Vec<u8> = (0..episode.len()).flat_map(|t| [(t % 251) as u8; 3]).collect();
+        episode.frames = vec![Frames::new("table", 1, 1, &bytes)];
         episode
     })
 }
@@ -147,7 +147,7 @@ proptest! {
     ) {
         let config_r = ReverseConfig::default();
         let hard: Vec<Episode> = recordings.iter().map(|e| reverse(e, &config_r)).collect();
-        let first = refine_reversed(&hard, &config, &config_r);
+        let first: Vec<Refined> = hard.iter().map(|e| kinematic_filter(e, &config, &config_r)).collect();
         let values: Vec<Vec<f32>> = first
             .iter()
             .flat_map(|r| &r.segments)

@@ -21,8 +21,8 @@ pub fn episode(index: u32) -> Episode {
         e.push(&Observation { state, frames: vec![] }, &std::array::from_fn(|i| i as f32 - t as f32))
             .expect("a row");
     }
-    let data = (0..3 * 4 * 5 * 3).map(|i| (i * 7 % 251) as u8).collect();
-    e.frames.push(Frames { camera: "table".to_owned(), height: 4, width: 5, data });
+    let bytes: Vec<u8> = (0..3 * 4 * 5 * 3).map(|i| (i * 7 % 251) as u8).collect();
+    e.frames.push(Frames::new("table", 4, 5, &bytes));
     e
 }
 

@@ -233,12 +233,12 @@ pub fn from_table(table: &Table, features: &Features, task: &str) -> Result<(Epi
         let (Some(camera), Some((height, width))) = (name.strip_prefix(IMAGES), feature.image_size()) else {
             continue;
         };
-        let mut data = Vec::with_capacity(table.rows * height * width * 3);
+        let mut images = Vec::with_capacity(table.rows);
         for (row, file) in table.png(name)?.iter().enumerate() {
             let what = format!("column `{name}`, row {row}");
-            data.extend(picture::decode(file, height, width, Path::new("(episode)"), &what)?);
+            images.push(picture::decode(file, height, width, Path::new("(episode)"), &what)?.into());
         }
-        frames.push(Frames { camera: camera.to_owned(), height, width, data });
+        frames.push(Frames { camera: camera.to_owned(), height, width, images });
     }
     let episode = Episode {
         state: rows(table, "observation.state")?,

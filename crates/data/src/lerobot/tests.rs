@@ -1,9 +1,10 @@
 use super::*;
 use crate::atomic::fuse;
 use crate::fixture::episode;
-use e2h_core::{Direction, Episode, Kind, Outcome};
+use e2h_core::{Direction, Episode, Frames, Kind, Outcome};
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 fn place() -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
@@ -16,7 +17,7 @@ fn numbered(n: usize) -> Episode {
     let mut e = episode(3 + n);
     e.origin.episode = n as u32;
     e.state[0][0] = -(n as f32);
-    e.frames[0].data[0] = n as u8;
+    Arc::make_mut(&mut e.frames[0].images[0])[0] = n as u8;
     e
 }
 
@@ -113,13 +114,13 @@ fn a_full_file_is_committed_by_itself() {
     // Noise does not compress: this is more than a file's worth of it.
     let side = 700;
     e.frames.truncate(1);
-    (e.frames[0].height, e.frames[0].width) = (side, side);
     let mut x = 1_u32;
     let mut noise = || {
         x = x.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         (x >> 24) as u8
     };
-    e.frames[0].data = (0..e.len() * side * side * 3).map(|_| noise()).collect();
+    let bytes: Vec<u8> = (0..e.len() * side * side * 3).map(|_| noise()).collect();
+    e.frames[0] = Frames::new(&e.frames[0].camera, side, side, &bytes);
     let mut writer = Writer::create(root.with_extension("big"), 20.0, None, features_of(&e)).unwrap();
     for _ in 0..25 {
         writer.push_episode(&e).unwrap();

@@ -3,6 +3,7 @@
 use crate::Result;
 use e2h_core::{Direction, Episode, Image, Kind, Origin, Outcome};
 use e2h_data::lerobot::{ACTION_NAMES, STATE_NAMES, decode_png};
+use std::sync::Arc;
 
 /// One column over time.
 pub(super) struct Series {
@@ -16,8 +17,8 @@ pub(super) struct Series {
 
 /// The pictures of one camera.
 pub(super) enum Pictures {
-    /// Pixels of all rows.
-    Raw(Vec<u8>),
+    /// The pixels of each row.
+    Raw(Vec<Arc<[u8]>>),
     /// A PNG file a row.
     Png(Vec<Vec<u8>>),
 }
@@ -35,9 +36,8 @@ impl Camera {
     pub(super) fn image(&self, row: usize) -> Result<Image> {
         let (height, width) = (self.height, self.width);
         match &self.pictures {
-            Pictures::Raw(data) => {
-                let n = height * width * 3;
-                let data = data.get(row * n..(row + 1) * n).unwrap_or(&[]).to_vec();
+            Pictures::Raw(images) => {
+                let data = images.get(row).map_or(vec![], |image| image.to_vec());
                 Ok(Image { height, width, data })
             }
             Pictures::Png(files) => {
@@ -186,7 +186,7 @@ impl Recording {
                     name: f.camera,
                     height: f.height,
                     width: f.width,
-                    pictures: Pictures::Raw(f.data),
+                    pictures: Pictures::Raw(f.images),
                 })
                 .collect(),
             ..Self::default()

@@ -220,13 +220,13 @@ fn frames(episode: &Episode, recording: &Table, source: &Source<'_>, size: usize
     let camera = |(name, feature): &(String, Feature)| {
         let Some((height, width)) = feature.image_size() else { bail!("{name}: expected an image") };
         let files = recording.png(name)?;
-        let mut data = Vec::with_capacity(episode.len() * size * size * 3);
+        let mut images = Vec::with_capacity(episode.len());
         for &row in &episode.source {
             let what = format!("column `{name}`, row {row}");
             let file = files.get(row as usize).with_context(|| what.clone())?;
-            data.extend(resize_image(&decode_png(file, height, width, &what)?, size, size)?.data);
+            images.push(resize_image(&decode_png(file, height, width, &what)?, size, size)?.data.into());
         }
-        Ok(Frames { camera: name.clone(), height: size, width: size, data })
+        Ok(Frames { camera: name.clone(), height: size, width: size, images })
     };
     source.cameras.iter().map(camera).collect()
 }

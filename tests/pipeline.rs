@@ -17,6 +17,7 @@ fn options(out: &Path) -> RunOptions {
         threads: None,
         quiet: true,
         tensorboard: false,
+        stop: auto_e2h::learn::Stop::default(),
     }
 }
 

@@ -320,6 +320,7 @@ fn open(out: &Path, change: &str) -> Run {
         threads: None,
         quiet: true,
         tensorboard: false,
+        stop: e2h_learn::Stop::default(),
     };
     Run::open(&options).unwrap()
 }

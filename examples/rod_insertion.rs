@@ -6,17 +6,18 @@
 //!
 //! The paper's algorithm 1, line by line.
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 mod common;
 
-use auto_e2h::core::Failure;
-use auto_e2h::learn::{Run, report};
+use auto_e2h::learn::Result;
+use common::{Learned, Run};
+use std::process::ExitCode;
 use std::time::Instant;
 
-fn main() -> Result<(), Failure> {
-    let run = Run::open(&common::options("rod_insertion")?)?;
+fn main() -> ExitCode {
+    common::main("rod_insertion", learn)
+}
 
+fn learn(run: &Run) -> Result<Learned> {
     // Line 1: easy demonstrations, their reversal, and a policy from each.
     let base = run.demonstrations()?;
     let mut easy = run.train_easy(&base)?;
@@ -38,8 +39,5 @@ fn main() -> Result<(), Failure> {
         records.push(run.evaluate(n, &hard, Some(&accepted))?);
     }
 
-    let (results, page) = run.report(&base, records)?;
-    println!("{}", report::table::iterations(&results));
-    println!("report: {}", page.display());
-    Ok(())
+    run.report(&base, records)
 }

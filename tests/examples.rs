@@ -18,7 +18,12 @@ fn nut_assembly_runs_from_nothing_and_its_checkpoint_evaluates() {
         !html.contains("http://") || html.contains("http://www.w3.org"),
         "the page refers to the network"
     );
-    assert!(out.join("results.json").exists());
+    // Every stage was there for real.
+    let results = std::fs::read_to_string(out.join("results.json")).unwrap();
+    let results: serde_json::Value = serde_json::from_str(&results).unwrap();
+    let last = &results["iterations"][1];
+    assert!(last["collection"]["accepted"].as_u64().unwrap() > 0, "{last}");
+    assert!(last["collection"]["critic_loss"].is_f64() && last["skipped"] == false, "{last}");
 
     // The log has a folder a stage: every step's loss of the first, every iteration's success of the loop.
     let steps = |stage: &str, tag: &str| -> Vec<i64> {

@@ -5,6 +5,7 @@
 mod architecture; // the invariants of ARCHITECTURE.md that a program can check
 mod errors; // wrong input and trouble with files: a clear message, before any work, nothing lost
 mod examples; // every example binary with the smoke preset
+mod faults; // signals, closed pipes, flipped bits and a MuJoCo that cannot go on
 mod pipeline; // refinement, critic and update on scripted rollouts
 mod resume; // kills at random instants, and thread counts: the same bytes
 
@@ -12,7 +13,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 /// Sizes at which the smoke preset takes seconds.
-const SMALL: [&str; 6] = [
+const SMALL: [&str; 7] = [
+    "--set=env.horizon_hard=48",
     "--set=train.easy_steps=12",
     "--set=train.initial_steps=12",
     "--set=train.update_steps=12",

@@ -10,13 +10,28 @@ fn options(out: &Path) -> RunOptions {
         task: "nut_assembly".to_owned(),
         preset: "smoke".to_owned(),
         seed: 5,
-        set: vec!["env.horizon_hard=500".to_owned(), "env.horizon_easy=500".to_owned()],
+        // People who pause, and little training.
+        set: [
+            "env.horizon_hard=500",
+            "env.horizon_easy=500",
+            "task.demonstrator.speed=[0.10, 0.22]",
+            "task.demonstrator.pause_probability=0.3",
+            "task.demonstrator.slow_probability=0.25",
+            "loop.demonstrations=2",
+            "loop.cycles=2",
+            "train.easy_steps=40",
+            "train.initial_steps=20",
+            "train.update_steps=20",
+        ]
+        .map(str::to_owned)
+        .to_vec(),
         out: Some(out.to_owned()),
         resume: false,
         device: "cpu".to_owned(),
         threads: None,
         quiet: true,
         tensorboard: false,
+        stop: auto_e2h::learn::Stop::default(),
     }
 }
 

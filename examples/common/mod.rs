@@ -1,8 +1,34 @@
-//! The command line that every benchmark example has.
+//! What every benchmark example has: a command line, a way to end, and words.
 
-use auto_e2h::learn::RunOptions;
+use auto_e2h::core::{Failure, mention, say};
+pub(crate) use auto_e2h::learn::Run;
+use auto_e2h::learn::record::RunResults;
+use auto_e2h::learn::{Error, Result, RunOptions, Stop, report};
 use clap::{Parser, ValueEnum};
 use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// What a run ends with: its results, and where its page is.
+pub(crate) type Learned = (RunResults, PathBuf);
+
+/// Learns a pair with what the command line asks for, and tells how it went. SIGINT and SIGTERM end it with its state saved, and
+/// with status 130 and 143.
+pub(crate) fn main(task: &str, learn: fn(&Run) -> Result<Learned>) -> ExitCode {
+    let done = options(task).and_then(|o| Run::open(&o)).and_then(|run| learn(&run));
+    let told = match done {
+        Ok((results, page)) => say(report::table::iterations(&results))
+            .and_then(|()| say(format_args!("report: {}", page.display())))
+            .map_err(Failure::from),
+        Err(Error::Stopped { signal }) => {
+            mention(Error::Stopped { signal });
+            return ExitCode::from(u8::try_from(128 + signal).unwrap_or(1));
+        }
+        Err(error) => Err(Failure::from(error)),
+    };
+    let Err(failure) = told else { return ExitCode::SUCCESS };
+    mention(format_args!("Error: {failure:?}"));
+    ExitCode::FAILURE
+}
 
 #[derive(Clone, Copy, ValueEnum)]
 enum Preset {
@@ -51,7 +77,7 @@ struct Arguments {
 }
 
 /// What the command line asks for.
-pub(crate) fn options(task: &str) -> anyhow::Result<RunOptions> {
+fn options(task: &str) -> Result<RunOptions> {
     let a = Arguments::parse();
     let preset = match a.preset {
         Preset::Smoke => "smoke",
@@ -71,5 +97,6 @@ pub(crate) fn options(task: &str) -> anyhow::Result<RunOptions> {
         threads: a.threads,
         quiet: a.quiet,
         tensorboard: a.tensorboard,
+        stop: Stop::on_signals()?,
     })
 }

@@ -17,6 +17,7 @@ mod episode;
 mod failure;
 mod pose;
 mod random;
+mod say;
 mod spelling;
 mod traits;
 
@@ -26,6 +27,7 @@ pub use episode::{
 pub use failure::Failure;
 pub use pose::{Pose, align_hemisphere, continue_signs};
 pub use random::{Rng, stream};
+pub use say::{mention, say};
 pub use spelling::{nearest, one_line};
 pub use traits::{ActionChunk, Policy, Value};
 

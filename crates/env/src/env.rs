@@ -125,17 +125,21 @@ impl Env {
     /// An external reset: the arm at home (with a little noise), the object at a start of `direction`; begins an episode.
     ///
     /// # Errors
-    /// When the arm cannot reach the start, or the start diverges; a sound task never does either.
+    /// [`Error::Diverged`] when the start does, which another draw may not; when the arm cannot reach the start. A sound task never
+    /// does either.
     pub fn reset(&mut self, direction: Direction, rng: &mut Rng) -> Result<()> {
         let home = self.sim.home_joints();
         let joints: [f64; JOINTS] = std::array::from_fn(|j| home[j] + gauss(rng, self.config.home_noise_rad));
         self.sim.clear(&joints);
-        self.task.place(direction, &mut self.sim, rng)?;
-        let trouble = self.sim.trouble();
-        self.sim.settle(SETTLE);
-        if self.sim.trouble() != trouble {
-            return Err(Error::MuJoCo("the start of an episode diverged".into()));
+        let placed = self.task.place(direction, &mut self.sim, rng);
+        if placed.is_ok() {
+            self.sim.settle(SETTLE);
         }
+        // None was left by `clear`, and each empties the counts of those before: any number means one since.
+        if self.sim.trouble() != 0 {
+            return Err(Error::Diverged("the start of an episode"));
+        }
+        placed?;
         self.begin(direction)
     }
 
@@ -155,12 +159,12 @@ impl Env {
     /// an episode, so its counters stand still. Where episodes do not start from there ([`Task::homes`]) nothing moves.
     ///
     /// # Errors
-    /// When the simulation diverges on the way.
+    /// [`Error::Diverged`] when the simulation does on the way; a [`Self::reset`] goes on from there.
     pub fn home(&mut self) -> Result<()> {
         if !self.task.homes() {
             return Ok(());
         }
-        let trouble = self.sim.trouble();
+        let (trouble, time) = (self.sim.trouble(), self.sim.time());
         self.sim.settle_open(OPENING);
         let home = self.sim.home();
         let mut above = self.sim.goal();
@@ -176,7 +180,9 @@ impl Env {
             }
         }
         self.sim.settle(SETTLE);
-        if self.sim.trouble() == trouble { Ok(()) } else { Err(Error::MuJoCo("homing diverged".into())) }
+        // Divergence sets both back.
+        let sound = self.sim.trouble() == trouble && self.sim.time() > time;
+        if sound { Ok(()) } else { Err(Error::Diverged("the way home")) }
     }
 
     fn travel(&mut self, goal: &Pose) {

@@ -75,6 +75,9 @@ pub enum Error {
     /// MuJoCo refused something; the message is its own.
     #[error("MuJoCo: {0}")]
     MuJoCo(String),
+    /// The simulation ran away where no episode is recorded; MuJoCo has set it back, and a reset goes on.
+    #[error("the simulation diverged: {0}")]
+    Diverged(&'static str),
     /// A scene lacks something that the environment needs.
     #[error("the scene has no {what} `{name}`")]
     Missing {

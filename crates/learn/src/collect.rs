@@ -3,7 +3,7 @@
 use crate::config::{AfterFailure, LoopConfig};
 use crate::explore::Wander;
 use crate::record::Automatic;
-use crate::rollout::{Finished, Lane, Rollout, drive};
+use crate::rollout::{self, Finished, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Episode, Kind, Origin, Outcome, Policy, stream};
 use e2h_env::Env;
@@ -89,8 +89,24 @@ pub fn collect(
     let reset = |lane: &mut Lane<Loop>, direction: Direction, cause: &str| -> Result<()> {
         let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
         let purpose = if direction == Direction::Hard { "collect/reset/hard" } else { "collect/reset/easy" };
-        *lane.state.collected.resets.entry(cause.to_owned()).or_default() += 1;
-        Ok(lane.env.reset(direction, &mut stream(seed, purpose, iteration, cycle as u64))?)
+        let mut count = |cause: &str, n| {
+            if n > 0 {
+                *lane.state.collected.resets.entry(cause.to_owned()).or_default() += n;
+            }
+        };
+        count(cause, 1);
+        count(
+            "reset_diverged",
+            rollout::reset(&mut lane.env, direction, seed, purpose, iteration, cycle as u64)?,
+        );
+        Ok(())
+    };
+    // Home without a reset; false: the way there diverged, which a reset has repaired.
+    let home = |lane: &mut Lane<Loop>, direction: Direction| -> Result<bool> {
+        match lane.env.home() {
+            Err(e2h_env::Error::Diverged(_)) => reset(lane, direction, "homing_diverged").map(|()| false),
+            done => Ok(done.map(|()| true)?),
+        }
     };
     let next = |lane: &mut Lane<Loop>, finished: Finished, direction: Direction| -> Result<()> {
         let Some(episode) = finished.episode else { return Ok(()) };
@@ -104,32 +120,29 @@ pub fn collect(
         match direction {
             Direction::Hard => {
                 lane.state.collected.hard.push(episode);
-                lane.state.at_goal = true;
                 let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
                 let cause = match (success, accident, config.after_failure) {
                     (_, Some(cause), _) => Some(cause),
                     (false, _, AfterFailure::Assembled) => Some("hard_failed"),
                     _ => None,
                 };
+                let by_itself = match cause {
+                    Some(cause) => reset(lane, Direction::Easy, cause).map(|()| false)?,
+                    None => !config.homing || home(lane, Direction::Easy)?,
+                };
+                // After a reset to the start of the easy task it is.
+                lane.state.at_goal = success || !by_itself;
                 let kind = lane.state.collected.kind(config, cycle);
                 kind.cycles += 1;
-                kind.resets += usize::from(cause.is_some());
-                match cause {
-                    Some(cause) => reset(lane, Direction::Easy, cause)?,
-                    None => {
-                        lane.state.at_goal = success;
-                        if config.homing {
-                            lane.env.home()?;
-                        }
-                    }
-                }
+                kind.resets += usize::from(!by_itself);
                 lane.state.collected.easy_rollouts += 1;
                 begin(lane, Direction::Easy)
             }
             Direction::Easy => {
                 let collected = &mut lane.state.collected;
                 collected.easy_successes += usize::from(success);
-                if let Some(&cycle) = lane.state.cycles.front() {
+                let done = lane.state.cycles.pop_front();
+                if let Some(cycle) = done {
                     let kind = collected.kind(config, cycle);
                     kind.easy_successes += usize::from(success);
                     kind.resets += usize::from(!success);
@@ -139,15 +152,16 @@ pub fn collect(
                 } else if config.keep_rollouts {
                     collected.rejected.push(episode);
                 }
-                lane.state.cycles.pop_front();
                 if lane.state.cycles.is_empty() {
                     return Ok(());
                 }
-                match (success, accident) {
-                    (_, Some(cause)) => reset(lane, Direction::Hard, cause)?,
-                    (false, _) => reset(lane, Direction::Hard, "easy_failed")?,
-                    (true, _) if config.homing => lane.env.home()?,
-                    _ => {}
+                let by_itself = match (success, accident) {
+                    (_, Some(cause)) => reset(lane, Direction::Hard, cause).map(|()| false)?,
+                    (false, _) => reset(lane, Direction::Hard, "easy_failed").map(|()| false)?,
+                    (true, _) => !config.homing || home(lane, Direction::Hard)?,
+                };
+                if let Some(cycle) = done.filter(|_| success && !by_itself) {
+                    lane.state.collected.kind(config, cycle).resets += 1;
                 }
                 begin(lane, Direction::Hard)
             }
@@ -189,6 +203,7 @@ pub fn collect(
     drive(&mut lanes, hard, easy, &|lane, finished, direction| next(lane, finished, direction), |lanes| {
         let (done, text) = summary(lanes);
         bar.set(done as u64, &text);
+        progress.check()
     })?;
     bar.finish(&summary(&lanes).1);
 

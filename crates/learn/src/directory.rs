@@ -8,6 +8,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use std::borrow::Borrow;
+use std::collections::BTreeMap;
 use std::fs::{File, TryLockError};
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
@@ -19,6 +20,10 @@ const FORMAT: u32 = 2;
 const ROBOT: &str = "panda";
 /// Beside the folders of a dataset: what this project knows of it.
 const NOTES: &str = "notes.json";
+/// Beside them too: SHA-256 of every other file of the dataset.
+const FILES: &str = "files.json";
+/// Begins a sealed JSON file, before the SHA-256 of all that follows it.
+const SEAL: &str = "{\n  \"sha256\": \"";
 /// State of a training in progress, in the folder of its policy.
 pub(crate) const TRAINING: &str = "training.safetensors";
 /// Ends the name of a dataset that is being written.
@@ -89,6 +94,10 @@ fn sweep(folder: &Path, depth: usize) -> Result<()> {
         }
     }
     Ok(())
+}
+
+fn hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
 
 pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
@@ -216,19 +225,46 @@ impl Directory {
     /// SHA-256 of a file, to verify it with when it is read again.
     pub(crate) fn sha256(&self, name: &str) -> Result<String> {
         let path = self.join(name);
-        let bytes = std::fs::read(&path).map_err(io("reading", &path))?;
-        Ok(Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect())
+        Ok(hex(&std::fs::read(&path).map_err(io("reading", &path))?))
     }
 
     /// Refuses a file that is not the one that was written; without a checksum any is taken.
     pub(crate) fn verify(&self, name: &str, sha256: Option<&str>) -> Result<()> {
         let Some(expected) = sha256 else { return Ok(()) };
-        let found = self.sha256(name)?;
+        self.compare(name, expected, self.sha256(name)?)
+    }
+
+    fn compare(&self, name: &str, expected: &str, found: String) -> Result<()> {
         if found == expected {
             return Ok(());
         }
         let (path, expected) = (self.join(name), e2h_core::one_line(expected));
         Err(Error::Foreign { path, quantity: "SHA-256".to_owned(), expected, found })
+    }
+
+    /// SHA-256 of every file below a folder, by its path there.
+    fn sums(&self, name: &str, below: &str, sums: &mut BTreeMap<String, String>) -> Result<()> {
+        let folder = self.join(name).join(below);
+        for entry in std::fs::read_dir(&folder).map_err(io("reading", &folder))?.flatten() {
+            let file = entry.file_name().to_string_lossy().into_owned();
+            let file = if below.is_empty() { file } else { format!("{below}/{file}") };
+            if entry.path().is_dir() {
+                self.sums(name, &file, sums)?;
+            } else {
+                let sum = self.sha256(&format!("{name}/{file}"))?;
+                sums.insert(file, sum);
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes `value`, which has named fields, as JSON with the SHA-256 of its text, which [`Directory::get`] compares.
+    pub(crate) fn put_sealed<T: Serialize>(&self, name: &str, value: &T) -> Result<()> {
+        let text = serde_json::to_string_pretty(value).map(|text| match text.strip_prefix("{\n") {
+            Some(rest) => format!("{SEAL}{}\",\n{rest}", hex(format!("{rest}\n").as_bytes())),
+            None => text,
+        });
+        self.put_text(name, text)
     }
 
     /// Writes `value` as JSON.
@@ -260,6 +296,15 @@ impl Directory {
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(e) => return Err(io("reading", &path)(e)),
         };
+        // Runs of version 0.1 have no seals.
+        let sealed = text.strip_prefix(SEAL).and_then(|rest| rest.split_once("\",\n"));
+        let text = match sealed {
+            Some((seal, rest)) => {
+                self.compare(name, seal, hex(rest.as_bytes()))?;
+                format!("{{\n{rest}")
+            }
+            None => text,
+        };
         serde_json::from_str(&text).map(Some).map_err(|e| Error::Foreign {
             path,
             quantity: "file".to_owned(),
@@ -290,12 +335,20 @@ impl Directory {
             writer.finish()?;
         }
         self.put(&format!("{beside_name}/{NOTES}"), notes)?;
+        let mut sums = BTreeMap::new();
+        self.sums(&beside_name, "", &mut sums)?;
+        self.put(&format!("{beside_name}/{FILES}"), &sums)?;
         std::fs::rename(&beside, &place).map_err(io("renaming to", &place))?;
         sync(place.parent().unwrap_or(Path::new(".")))
     }
 
-    /// Reads what [`Directory::put_episodes`] wrote; none when it is not there.
+    /// Reads what [`Directory::put_episodes`] wrote, every byte of it verified; none when it is not there.
     pub(crate) fn get_episodes<T: DeserializeOwned>(&self, name: &str) -> Result<Option<(Vec<Episode>, T)>> {
+        // Runs of version 0.1 have no sums.
+        let sums: Option<BTreeMap<String, String>> = self.get(&format!("{name}/{FILES}"))?;
+        for (file, sum) in sums.iter().flatten() {
+            self.verify(&format!("{name}/{file}"), Some(sum))?;
+        }
         let Some(notes) = self.get(&format!("{name}/{NOTES}"))? else { return Ok(None) };
         let root = self.join(name);
         if !root.join("meta").exists() {

@@ -33,6 +33,15 @@ pub enum Error {
         /// What is there.
         found: String,
     },
+    /// Somebody asked the program to stop. What is done is saved.
+    #[error("stopped by {}; --resume goes on from here", signal_name(.signal))]
+    Stopped {
+        /// Number of the signal.
+        signal: i32,
+    },
+    /// The system does not let signals be handled.
+    #[error("handling signals: {0}")]
+    Signals(std::io::Error),
     /// This build cannot do what was asked.
     #[error("{0}")]
     Unsupported(String),
@@ -78,6 +87,14 @@ pub enum Error {
     /// The report could not be made.
     #[error(transparent)]
     Report(#[from] crate::report::Error),
+}
+
+fn signal_name(signal: &i32) -> String {
+    match *signal {
+        signal_hook::consts::SIGINT => "SIGINT".to_owned(),
+        signal_hook::consts::SIGTERM => "SIGTERM".to_owned(),
+        other => format!("signal {other}"),
+    }
 }
 
 /// Shorthand for a result with this crate's [`enum@Error`].

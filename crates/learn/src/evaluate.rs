@@ -1,7 +1,7 @@
 //! Success of a policy over trials at fixed seeds.
 
 use crate::record::{Evaluation, wilson95};
-use crate::rollout::{Film, Lane, Rollout, drive};
+use crate::rollout::{self, Film, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Image, Outcome, Policy, stream};
 use e2h_env::Env;
@@ -93,7 +93,7 @@ pub fn evaluate(
     let begin = |lane: &mut Lane<Queue>| -> Result<()> {
         let Some(trial) = lane.state.trials.pop() else { return Ok(()) };
         lane.state.current = trial;
-        lane.env.reset(direction, &mut stream(seed, "evaluate/reset", 0, trial as u64))?;
+        rollout::reset(&mut lane.env, direction, seed, "evaluate/reset", 0, trial as u64)?;
         let rng = stream(seed, "evaluate/act", 0, trial as u64);
         let mut rollout = Rollout::begin(&mut lane.env, direction, policy.n_obs_steps(), rng, None)?;
         if films(trial) {
@@ -127,6 +127,7 @@ pub fn evaluate(
             let done = || lanes.iter().flat_map(|l| &l.state.done);
             let k = done().filter(|(_, t, _)| t.outcome.is_success()).count();
             bar.set(done().count() as u64, &format!("{k} succeeded"));
+            progress.check()
         },
     )?;
     let mut done: Vec<(usize, Trial, Option<Film>)> = vec![];

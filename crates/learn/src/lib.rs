@@ -16,6 +16,7 @@
 //!     threads: None,
 //!     quiet: false,
 //!     tensorboard: false,
+//!     stop: Default::default(),
 //! };
 //! let run = Run::open(&options)?;
 //! let base = run.demonstrations()?;
@@ -39,6 +40,7 @@ pub mod record;
 pub mod report;
 mod rollout;
 mod run;
+mod stop;
 pub mod tensorboard;
 pub mod view;
 
@@ -50,3 +52,4 @@ pub use explore::ExploreConfig;
 pub use progress::{Bar, Progress};
 pub use published::Published;
 pub use run::{Accepted, Base, Run, RunOptions, set_threads};
+pub use stop::Stop;

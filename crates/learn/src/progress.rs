@@ -1,5 +1,7 @@
 //! One progress line a stage, on standard error, with what matters in it.
 
+use crate::{Result, Stop};
+use e2h_core::mention;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::cell::Cell;
 use std::io::IsTerminal as _;
@@ -8,10 +10,11 @@ use std::time::{Duration, Instant};
 /// Seconds between two lines of a stage where standard error is no terminal.
 const LINE_EVERY: Duration = Duration::from_secs(30);
 
-/// Where progress is shown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Where progress is shown, and where a stage hears that it should stop.
+#[derive(Debug, Clone)]
 pub struct Progress {
     quiet: bool,
+    stop: Stop,
 }
 
 /// The line of one stage.
@@ -29,7 +32,21 @@ impl Progress {
     /// `quiet` shows nothing.
     #[must_use]
     pub fn new(quiet: bool) -> Self {
-        Self { quiet }
+        Self { quiet, stop: Stop::default() }
+    }
+
+    /// The same, for stages that `stop` may stop.
+    #[must_use]
+    pub fn stopping(self, stop: Stop) -> Self {
+        Self { stop, ..self }
+    }
+
+    /// Asked by stages wherever they can end and lose nothing that they have not told.
+    ///
+    /// # Errors
+    /// [`crate::Error::Stopped`] when the program was asked to stop.
+    pub fn check(&self) -> Result<()> {
+        self.stop.check()
     }
 
     /// A line for a stage of `total` units.
@@ -53,7 +70,7 @@ impl Progress {
     /// A line of text between stages.
     pub fn say(&self, text: &str) {
         if !self.quiet {
-            eprintln!("{text}");
+            mention(text);
         }
     }
 }
@@ -63,11 +80,15 @@ impl Bar {
     pub fn set(&self, done: u64, message: &str) {
         self.bar.set_position(done);
         self.bar.set_message(message.to_owned());
-        if let Some(line) = self.line.as_ref().filter(|l| l.get().elapsed() >= LINE_EVERY) {
-            line.set(Instant::now());
+        if let Some(last) = self.line.as_ref().filter(|l| l.get().elapsed() >= LINE_EVERY) {
+            last.set(Instant::now());
             let seconds = self.start.elapsed().as_secs_f64();
             let left = seconds / done.max(1) as f64 * self.total.saturating_sub(done) as f64;
-            eprintln!("{:<24} {done}/{} {left:.0} s left, {message}", self.name, self.total);
+            mention(format_args!(
+                "{:<24} {}",
+                self.name,
+                format_args!("{done}/{} {left:.0} s left, {message}", self.total)
+            ));
         }
     }
 
@@ -75,7 +96,11 @@ impl Bar {
     pub fn finish(self, message: &str) {
         self.bar.finish_and_clear();
         if !self.quiet {
-            eprintln!("{:<24} {message} ({:.0} s)", self.name, self.start.elapsed().as_secs_f64());
+            mention(format_args!(
+                "{:<24} {}",
+                self.name,
+                format_args!("{message} ({:.0} s)", self.start.elapsed().as_secs_f64())
+            ));
         }
     }
 }

@@ -6,7 +6,7 @@
 
 use crate::Result;
 use crate::explore::Wander;
-use e2h_core::{Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng};
+use e2h_core::{Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng, stream};
 use e2h_env::Env;
 use rayon::prelude::*;
 use std::collections::VecDeque;
@@ -115,6 +115,36 @@ impl Rollout {
     }
 }
 
+/// Draws of one start before it is given up: chance does not fail so often.
+const MOST_STARTS: u64 = 10;
+
+/// An external reset. A start that diverges is drawn again from a stream of its own; returns how many did.
+///
+/// # Errors
+/// When all do, or none can be made.
+pub(crate) fn reset(
+    env: &mut Env,
+    direction: Direction,
+    seed: u64,
+    purpose: &str,
+    iteration: u64,
+    index: u64,
+) -> Result<usize> {
+    let mut diverged = 0;
+    loop {
+        let mut rng = match diverged {
+            0 => stream(seed, purpose, iteration, index),
+            // No other purpose ends so.
+            again => stream(seed, &format!("{purpose}/again/{again}"), iteration, index),
+        };
+        match env.reset(direction, &mut rng) {
+            Ok(()) => return Ok(diverged as usize),
+            Err(e2h_env::Error::Diverged(_)) if diverged + 1 < MOST_STARTS => diverged += 1,
+            Err(e) => return Err(e.into()),
+        }
+    }
+}
+
 /// One simulation and what it is doing.
 pub(crate) struct Lane<S> {
     pub(crate) env: Env,
@@ -127,13 +157,14 @@ pub(crate) struct Lane<S> {
 pub(crate) type Next<'a, S> = dyn Fn(&mut Lane<S>, Finished, Direction) -> Result<()> + Sync + 'a;
 
 /// Runs all lanes until none has a rollout. `next` is called with a lane whose rollout just ended (what it left, and which
-/// task it did) and starts its next one, if there is to be one; it runs on the lane's own thread. `tick` hears how many lanes still run.
+/// task it did) and starts its next one, if there is to be one; it runs on the lane's own thread. `tick` sees how far lanes are,
+/// and may end all.
 pub(crate) fn drive<S: Send>(
     lanes: &mut [Lane<S>],
     hard: &dyn Policy,
     easy: &dyn Policy,
     next: &Next<'_, S>,
-    mut tick: impl FnMut(&[Lane<S>]),
+    mut tick: impl FnMut(&[Lane<S>]) -> Result<()>,
 ) -> Result<()> {
     loop {
         let mut waiting: Vec<&mut Lane<S>> = lanes.iter_mut().filter(|l| l.rollout.is_some()).collect();
@@ -170,6 +201,6 @@ pub(crate) fn drive<S: Send>(
             }
             Ok(())
         })?;
-        tick(lanes);
+        tick(lanes)?;
     }
 }

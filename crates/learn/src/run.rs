@@ -11,7 +11,7 @@ use crate::directory::{Directory, TRAINING, write_atomic};
 use crate::picture;
 use crate::record::{Collection, Reversal};
 use crate::tensorboard::Events;
-use crate::{Error, Progress, Result};
+use crate::{Error, Progress, Result, Stop};
 use e2h_core::{Direction, Episode, Kind, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_env::{Env, Task, demonstrate};
@@ -20,6 +20,7 @@ use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData, train_criti
 use e2h_refine::{Goal, Refined, critic_filter, gate, kinematic_filter, reverse};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -48,6 +49,8 @@ pub struct RunOptions {
     pub quiet: bool,
     /// Write TensorBoard event files into the run directory's `tensorboard/`. Never changes a result.
     pub tensorboard: bool,
+    /// Ends a stage early, its state saved, when it is asked to.
+    pub stop: Stop,
 }
 
 /// A run in progress.
@@ -119,7 +122,7 @@ impl Run {
             PathBuf::from(format!("runs/{}-{}-{}", options.task, options.preset, options.seed))
         });
         let dir = Directory::open(&path, options.resume, &options.task, options.seed, &resolved)?;
-        let progress = Progress::new(options.quiet);
+        let progress = Progress::new(options.quiet).stopping(options.stop.clone());
         // Known to the task, not to be chosen.
         resolved.config.refine.reverse.object_reference = Some(task.object_reference());
         Ok(Self { options: options.clone(), resolved, dir, progress, compute, task, env })
@@ -176,13 +179,22 @@ impl Run {
                 let mut failed = 0;
                 let mut index = 0;
                 while episodes.len() < wanted {
+                    self.progress.check()?;
                     let origin =
                         Origin::demonstration(&self.options.task, Direction::Easy, index, self.options.seed);
                     let mut rng = stream(self.options.seed, "demonstrate", 0, u64::from(index));
-                    let episode =
-                        demonstrate(&mut env, Direction::Easy, &c.task.demonstrator, origin, &mut rng)?;
+                    let episode = match demonstrate(
+                        &mut env,
+                        Direction::Easy,
+                        &c.task.demonstrator,
+                        origin,
+                        &mut rng,
+                    ) {
+                        Err(e2h_env::Error::Diverged(_)) => None,
+                        recorded => Some(recorded?).filter(|e| e.outcome.is_success()),
+                    };
                     index += 1;
-                    if episode.outcome.is_success() {
+                    if let Some(episode) = episode {
                         episodes.push(episode);
                     } else {
                         failed += 1;
@@ -195,10 +207,10 @@ impl Run {
                     }
                     bar.set(episodes.len() as u64, &format!("{failed} failed"));
                 }
-                bar.finish(&format!("{wanted} recorded, {failed} failed"));
                 let minutes = start.elapsed().as_secs_f64() / 60.0;
                 let notes = BTreeMap::from([("minutes".to_owned(), minutes)]);
                 self.dir.put_episodes("demonstrations", &episodes, &notes)?;
+                bar.finish(&format!("{wanted} recorded, {failed} failed"));
                 episodes
             }
         };
@@ -341,34 +353,31 @@ impl Run {
             _ => None,
         };
         let bar = self.progress.bar(name, steps as u64);
-        let mut recent = std::collections::VecDeque::with_capacity(100);
-        let mean = |recent: &std::collections::VecDeque<f32>| {
-            recent.iter().map(|&l| f64::from(l)).sum::<f64>() / recent.len().max(1) as f64
+        let save = |trainer: &Trainer| {
+            let folder = self.dir.join(place);
+            std::fs::create_dir_all(&folder).map_err(crate::directory::io("creating", &folder))?;
+            Ok::<(), Error>(trainer.save(&saved)?)
         };
         while trainer.step_count() < steps {
-            let loss = trainer.step(&data)?;
-            if recent.len() == 100 {
-                recent.pop_front();
+            if let Err(stopped) = self.progress.check() {
+                save(&trainer)?;
+                return Err(stopped);
             }
-            recent.push_back(loss);
+            let loss = trainer.step(&data)?;
             let done = trainer.step_count();
             if let Some(events) = &mut events {
                 events.scalar("train/loss", done as u64, now(), loss.into())?;
             }
             if done % 10 == 0 {
                 events.as_mut().map_or(Ok(()), Events::flush)?;
-                bar.set(done as u64, &format!("loss {:.4}", mean(&recent)));
+                bar.set(done as u64, &format!("loss {:.4}", trainer.mean_loss()));
             }
-            // Not in the last hundred steps, so that the mean loss of a resumed run is of as many steps as ever.
-            if done % c.train.save_every == 0 && done + 100 <= steps {
-                std::fs::create_dir_all(self.dir.join(place))
-                    .map_err(crate::directory::io("creating", &self.dir.join(place)))?;
-                trainer.save(&saved)?;
+            if done % c.train.save_every == 0 && done < steps {
+                save(&trainer)?;
             }
         }
         events.map(Events::finish).transpose()?;
-        let loss = mean(&recent);
-        bar.finish(&format!("{steps} steps, loss {loss:.4}"));
+        let loss = trainer.mean_loss();
         let weights = match (steps, weights) {
             (0, Some(weights)) => weights,
             _ => trainer.weights()?,
@@ -377,13 +386,14 @@ impl Run {
             DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?.on(&self.compute)?;
         policy.save(&self.dir.join(place), &self.provenance(direction, iteration)?)?;
         let minutes = clock.elapsed().as_secs_f64() / 60.0;
-        self.dir.put(
+        self.dir.put_sealed(
             &notes_file,
             &TrainNotes { minutes, loss, policy_sha256: Some(self.dir.sha256(&description)?) },
         )?;
         if saved.exists() {
             std::fs::remove_file(&saved).map_err(crate::directory::io("removing", &saved))?;
         }
+        bar.finish(&format!("{steps} steps, loss {loss:.4}"));
         Ok(policy)
     }
 
@@ -512,7 +522,7 @@ impl Run {
             let name = format!("critic {iteration}");
             let network = &c.critic.network;
             let bar = self.progress.bar(&name, network.steps as u64);
-            let (critic, report) = train_critic(
+            let trained = train_critic(
                 &c.policy,
                 network,
                 &self.compute,
@@ -522,8 +532,21 @@ impl Run {
                 c.env.horizon_hard,
                 self.options.seed,
                 &format!("critic/{iteration}"),
-                |step, loss| bar.set(step as u64, &format!("loss {loss:.4}")),
-            )?;
+                |step, loss| {
+                    bar.set(step as u64, &format!("loss {loss:.4}"));
+                    if self.progress.check().is_ok() {
+                        ControlFlow::Continue(())
+                    } else {
+                        ControlFlow::Break(())
+                    }
+                },
+            );
+            let (critic, report) = match trained {
+                Err(e2h_policy::Error::Stopped { .. }) => {
+                    return Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }));
+                }
+                done => done?,
+            };
             bar.finish(&format!(
                 "loss {:.4}, held out {:.4}",
                 report.train_loss,

@@ -85,7 +85,7 @@ fn values_that_contradict_each_other_are_refused() {
         (&["env.image_size=40"][..], "policy.image_size"),
         (&["env.cameras=false"], "env.cameras"),
         (&["policy.guidance=2.0"], "conditioning_dropout"),
-        (&["env.hold_steps=49"], "hold_steps"),
+        (&["env.hold_steps=301"], "hold_steps"),
         (&["critic.network.crop_size=33"], "crop_size"),
         (&["refine.gate.closings=3"], "closings"),
         (&["task.demonstrator.speed=[0.2, 0.1]"], "speed"),
@@ -120,18 +120,25 @@ type Change = (&'static str, Result<(Stage, &'static str), &'static str>);
 const BASE: &[&str] = &[
     "task.demonstrator.pause_probability=1.0",
     "task.demonstrator.slow_probability=1.0",
+    "task.demonstrator.speed=[0.10, 0.22]",
     "env.image_size=24",
+    "env.horizon_hard=48",
     "env.horizon_easy=500",
     "loop.demonstrations=1",
+    "loop.cycles=2",
     "loop.loops=1",
     "loop.after_failure=continue",
     "loop.keep_rollouts=true", // so that easy rollouts that fail are seen
     "policy.image_size=24",
     "policy.crop_size=20",
     "policy.n_action_steps=8",
+    "policy.down_dims=[16, 32]",
+    "policy.step_embed_dim=16",
     "train.easy_steps=3",
     "train.initial_steps=3",
     "train.update_steps=3",
+    "train.step.conditions=8",
+    "train.step.noises=2",
     "train.step.conditioning_dropout=0.5",
     "train.step.adam.weight_decay=0.01",
     "train.step.schedule.warmup=0",
@@ -320,6 +327,7 @@ fn open(out: &Path, change: &str) -> Run {
         threads: None,
         quiet: true,
         tensorboard: false,
+        stop: e2h_learn::Stop::default(),
     };
     Run::open(&options).unwrap()
 }

@@ -63,7 +63,7 @@ impl Checkpoint {
     /// `policy.json` is whole.
     ///
     /// # Errors
-    /// When the folder cannot be written.
+    /// When a weight is not finite, and nothing is written then; when the folder cannot be written.
     pub fn write(&self, dir: &Path, weights: &Weights) -> Result<()> {
         self.write_with(dir, weights, &BTreeMap::new())
     }
@@ -79,8 +79,9 @@ impl Checkpoint {
             let path = path.to_owned();
             move |source| Error::Io { doing, path, source }
         };
-        std::fs::create_dir_all(dir).map_err(io("creating", dir))?;
         let weights_path = dir.join(WEIGHTS_FILE);
+        finite(weights, &weights_path)?;
+        std::fs::create_dir_all(dir).map_err(io("creating", dir))?;
         e2h_nn::save_weights(&weights_path, weights, metadata)?;
         let bytes = std::fs::read(&weights_path).map_err(io("reading back", &weights_path))?;
         let file = File {
@@ -164,14 +165,20 @@ pub(crate) fn read_weights_without(
     skip: impl Fn(&str) -> bool,
 ) -> Result<(Weights, BTreeMap<String, String>)> {
     let (weights, metadata) = e2h_nn::load_weights_without(path, skip)?;
-    for (name, tensor) in &weights {
+    finite(&weights, path)?;
+    Ok((weights, metadata))
+}
+
+/// Weights to act with are numbers, read or written.
+fn finite(weights: &Weights, path: &Path) -> Result<()> {
+    for (name, tensor) in weights {
         if let Some(entry) = tensor.data.iter().position(|v| !v.is_finite()) {
             let problem =
                 format!("`{name}`, entry {entry}: expected a finite number, found {}", tensor.data[entry]);
             return Err(Error::Checkpoint { path: path.to_owned(), problem });
         }
     }
-    Ok((weights, metadata))
+    Ok(())
 }
 
 pub(crate) fn hex(bytes: &[u8]) -> String {

@@ -3,6 +3,7 @@
 use crate::batch::{Host, Rows};
 use crate::config::without_zero_clip;
 use crate::model::ConditionEncoder;
+use crate::train::{Skipped, sound};
 use crate::{CriticConfig, EncoderNorm, Error, PolicyConfig, Result};
 use candle_core::Tensor;
 use e2h_core::{Episode, Rng, Value, stream};
@@ -10,6 +11,7 @@ use e2h_data::Normaliser;
 use e2h_nn::{Adam, Builder, Compute, Mlp, Mode, Params, Weights, backward};
 use rand::Rng as _;
 use rand::seq::SliceRandom as _;
+use std::ops::ControlFlow;
 
 /// A value function on two-step visual-state input.
 pub struct Critic {
@@ -178,10 +180,11 @@ fn target(episode: &Episode, t: usize, horizon: usize) -> f32 {
 /// Trains a critic from scratch on hard rollouts, failures included; its encoders start from the policy's weights. It is
 /// computed, then and later, by `compute`.
 ///
-/// `progress` is told (steps done, loss) after every step.
+/// `progress` is told (steps done, loss) after every step, and may end the training.
 ///
 /// # Errors
-/// When there are no rollouts, they do not fit, or the loss is not finite.
+/// When there are no rollouts, they do not fit, the loss or a weight is not finite, the gradient has been too long for several steps,
+/// or `progress` broke off.
 #[allow(clippy::too_many_arguments, reason = "each is a different thing, and none has a natural default")]
 pub fn train_critic(
     policy: &PolicyConfig,
@@ -193,7 +196,7 @@ pub fn train_critic(
     horizon: usize,
     seed: u64,
     purpose: &str,
-    mut progress: impl FnMut(usize, f32),
+    mut progress: impl FnMut(usize, f32) -> ControlFlow<()>,
 ) -> Result<(Critic, CriticReport)> {
     let mut order: Vec<&Episode> = rollouts.iter().filter(|e| !e.is_empty()).collect();
     if order.is_empty() {
@@ -207,6 +210,7 @@ pub fn train_critic(
     network.adopt_encoders(policy_weights)?;
     let mut adam = Adam::new(&without_zero_clip(critic.adam), &network.params)?;
     let mut losses = Vec::with_capacity(critic.steps);
+    let mut skipped = Skipped::default();
     for step in 0..critic.steps {
         let mut rng = stream(seed, purpose, 0, step as u64);
         let mut host = Host::new(&network.config);
@@ -225,13 +229,17 @@ pub fn train_critic(
             return Err(Error::NotFinite { step, seed, loss: value });
         }
         let grads = backward(&loss, &network.params)?;
-        adam.step(&network.params, &grads, critic.adam.lr)?;
+        skipped.after(adam.step(&network.params, &grads, critic.adam.lr)?, step, seed)?;
         losses.push(value);
-        progress(step + 1, value);
+        if progress(step + 1, value).is_break() {
+            return Err(Error::Stopped { step: step + 1 });
+        }
     }
 
     let trained = Critic::new(policy, critic, compute, normaliser, Mode::Infer, seed)?;
-    trained.params.import(&network.params.export()?)?;
+    let weights = network.params.export()?;
+    sound(&weights, critic.steps, seed)?;
+    trained.params.import(&weights)?;
     let mut squares = (0.0, 0usize);
     for episode in validation {
         for (t, v) in trained.evaluate(episode)?.iter().enumerate() {

@@ -24,7 +24,7 @@ pub enum Error {
     Data(String),
     /// The loss is not a finite number.
     #[error(
-        "training diverged: the loss is {loss} at step {step} (seed {seed}); the last good checkpoint is kept"
+        "training diverged: the loss is {loss} at step {step} (seed {seed}); the last sound state is kept"
     )]
     NotFinite {
         /// Step at which it appeared.
@@ -33,6 +33,42 @@ pub enum Error {
         seed: u64,
         /// The loss.
         loss: f32,
+    },
+    /// A weight, or a number beside it that training goes on from, is not finite.
+    #[error(
+        "training diverged: `{name}`: expected finite numbers, found {found} after step {step} (seed {seed}); it is not written, \
+         the last sound state is kept"
+    )]
+    Weight {
+        /// The tensor.
+        name: String,
+        /// The first number that is none.
+        found: f32,
+        /// Steps done.
+        step: usize,
+        /// Seed of the training run.
+        seed: u64,
+    },
+    /// Nothing is learned any more.
+    #[error(
+        "training diverged: the gradient's length was {norm} in {steps} steps in a row, up to step {step} (seed {seed}), and the \
+         optimiser left them out; the last sound state is kept, try a smaller learning rate"
+    )]
+    Skipped {
+        /// Steps in a row.
+        steps: usize,
+        /// The length of the last gradient.
+        norm: f32,
+        /// The last step.
+        step: usize,
+        /// Seed of the training run.
+        seed: u64,
+    },
+    /// Training ended early because the caller asked for it.
+    #[error("stopped after {step} steps, as asked")]
+    Stopped {
+        /// Steps done.
+        step: usize,
     },
     /// A checkpoint that does not match what is asked of it; lists all that differs.
     #[error("checkpoint {path}: {}", printable(.problem))]

@@ -10,7 +10,7 @@ use e2h_nn::{
 };
 use rand::Rng as _;
 use sha2::{Digest as _, Sha256};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -81,6 +81,33 @@ fn digest(weights: &Weights) -> String {
     hasher.finalize().iter().map(|b| format!("{b:02x}")).collect()
 }
 
+/// Losses that the mean is of.
+const RECENT: usize = 100;
+/// Steps in a row whose gradient was too long to be a number, after which nothing is learned any more.
+const MOST_SKIPPED: usize = 5;
+
+/// Refuses weights that are no numbers, which nobody can act with.
+pub(crate) fn sound(weights: &Weights, step: usize, seed: u64) -> Result<()> {
+    for (name, tensor) in weights {
+        if let Some(found) = tensor.data.iter().find(|v| !v.is_finite()) {
+            return Err(Error::Weight { name: name.clone(), found: *found, step, seed });
+        }
+    }
+    Ok(())
+}
+
+/// Counts steps in a row that the optimiser left out, and refuses too many.
+#[derive(Default)]
+pub(crate) struct Skipped(usize);
+
+impl Skipped {
+    /// `norm` is what the optimiser said of the step.
+    pub(crate) fn after(&mut self, norm: f32, step: usize, seed: u64) -> Result<()> {
+        self.0 = if norm.is_finite() { 0 } else { self.0 + 1 };
+        if self.0 < MOST_SKIPPED { Ok(()) } else { Err(Error::Skipped { steps: self.0, norm, step, seed }) }
+    }
+}
+
 /// A policy in training: network, optimiser, average of the weights, step counter.
 pub struct Trainer {
     model: DiffusionModel,
@@ -93,6 +120,9 @@ pub struct Trainer {
     seed: u64,
     purpose: String,
     step: usize,
+    skipped: Skipped,
+    /// Of the last steps.
+    losses: VecDeque<f32>,
 }
 
 impl Trainer {
@@ -143,6 +173,8 @@ impl Trainer {
             seed,
             purpose: purpose.to_owned(),
             step: 0,
+            skipped: Skipped::default(),
+            losses: VecDeque::with_capacity(RECENT),
         })
     }
 
@@ -170,6 +202,12 @@ impl Trainer {
         self.step
     }
 
+    /// Mean loss of the last hundred steps; 0 before the first.
+    #[must_use]
+    pub fn mean_loss(&self) -> f64 {
+        self.losses.iter().map(|&l| f64::from(l)).sum::<f64>() / self.losses.len().max(1) as f64
+    }
+
     /// One optimiser step; returns its loss.
     ///
     /// # Source
@@ -177,7 +215,7 @@ impl Trainer {
     /// actions past the end of a cut segment.
     ///
     /// # Errors
-    /// When the data do not fit, or the loss is not finite.
+    /// When the data do not fit, the loss is not finite, or the gradient has been too long for several steps.
     pub fn step(&mut self, data: &TrainingData<'_>) -> Result<f32> {
         // A stream a step: nothing of the generator has to be stored for an exact resume.
         let mut rng = stream(self.seed, &self.purpose, 0, self.step as u64);
@@ -188,9 +226,14 @@ impl Trainer {
         }
         let grads = backward(&loss, &self.model.params)?;
         let lr = learning_rate(&self.schedule, self.step);
-        self.adam.step(&self.model.params, &grads, lr)?;
+        let norm = self.adam.step(&self.model.params, &grads, lr)?;
+        self.skipped.after(norm, self.step, self.seed)?;
         self.ema.update(&self.model.params)?;
         self.step += 1;
+        if self.losses.len() == RECENT {
+            self.losses.pop_front();
+        }
+        self.losses.push_back(value);
         Ok(value)
     }
 
@@ -268,15 +311,17 @@ impl Trainer {
     /// The averaged weights: the policy to act with.
     ///
     /// # Errors
-    /// When they cannot be read back.
+    /// When they cannot be read back, or one of them is not finite.
     pub fn weights(&self) -> Result<Weights> {
-        Ok(self.ema.weights()?)
+        let weights = self.ema.weights()?;
+        sound(&weights, self.step, self.seed)?;
+        Ok(weights)
     }
 
     /// Writes everything that [`Trainer::restore`] needs to go on as if nothing had happened.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// When the file cannot be written, or a number is not finite: the file that was there stays.
     pub fn save(&self, path: &Path) -> Result<()> {
         let mut all = Weights::new();
         for (part, tensors) in
@@ -284,7 +329,13 @@ impl Trainer {
         {
             all.extend(tensors.into_iter().map(|(name, t)| (format!("{part}/{name}"), t)));
         }
-        all.insert("step".to_owned(), HostTensor { shape: vec![1], data: vec![self.step as f32] });
+        sound(&all, self.step, self.seed)?;
+        let mut add = |name: &str, data: Vec<f32>| {
+            all.insert(name.to_owned(), HostTensor { shape: vec![data.len()], data });
+        };
+        add("step", vec![self.step as f32]);
+        add("skipped", vec![self.skipped.0 as f32]);
+        add("losses", self.losses.iter().copied().collect());
         let seal = BTreeMap::from([(SEAL.to_owned(), digest(&all))]);
         Ok(e2h_nn::save_weights(path, &all, &seal)?)
     }
@@ -306,7 +357,10 @@ impl Trainer {
                 return Err(Error::Checkpoint { path: path.to_owned(), problem });
             }
         }
-        let step = all.remove("step").and_then(|t| t.data.first().copied());
+        // States of version 0.1 have a step only.
+        let mut number = |name: &str| all.remove(name).and_then(|t| t.data.first().copied());
+        let (step, skipped) = (number("step"), number("skipped").unwrap_or_default());
+        let losses = all.remove("losses").map(|t| t.data).unwrap_or_default();
         let step = step.ok_or_else(|| Error::Checkpoint {
             path: path.to_owned(),
             problem: "expected a training state with tensor `step`, found none".to_owned(),
@@ -320,6 +374,8 @@ impl Trainer {
         self.adam.load_state(&part("adam/"))?;
         self.ema.load_state(&part("ema/"))?;
         self.step = step as usize;
+        self.skipped = Skipped(skipped as usize);
+        self.losses = losses.into_iter().take(RECENT).collect();
         Ok(())
     }
 }

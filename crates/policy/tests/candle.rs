@@ -175,7 +175,7 @@ fn the_critic_is_the_same() {
             100,
             0,
             "critic",
-            |_, _| {},
+            |_, _| std::ops::ControlFlow::Continue(()),
         )
         .unwrap();
         (critic.evaluate(&rollouts[0]).unwrap(), report)

@@ -231,7 +231,7 @@ fn a_critic_learns_that_successes_end_higher_than_failures() {
         100,
         0,
         "critic",
-        |_, _| {},
+        |_, _| std::ops::ControlFlow::Continue(()),
     )
     .unwrap();
     assert!(report.train_loss < 0.05, "{}", report.train_loss);

@@ -31,7 +31,8 @@ thread_local! { static SCRATCH: Scratch = Scratch::new(|root| {
     let policy = DiffusionPolicy::untrained(&network, &ranges, 1).expect("a policy");
     let weights = policy.weights().expect("weights");
     let (critic, _) = train_critic(
-        &network, &config, &Compute::cpu(), &ranges, &weights, &[episode(0)], 10, 0, "fuzz", |_, _| (),
+        &network, &config, &Compute::cpu(), &ranges, &weights, &[episode(0)], 10, 0, "fuzz",
+        |_, _| std::ops::ControlFlow::Continue(()),
     )
     .expect("a critic");
     critic.save(root, &config, &CriticProvenance::default()).expect("a folder");

@@ -6,8 +6,9 @@ use crate::evaluate::{Filmed, Filming, evaluate};
 use crate::picture;
 use crate::record::{IterationRecord, RunResults};
 use crate::report;
+use crate::rollout;
 use crate::view::scalars;
-use e2h_core::{Direction, Episode, stream};
+use e2h_core::{Direction, Episode};
 use e2h_policy::DiffusionPolicy;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -69,7 +70,7 @@ impl Run {
             loss: trained.map_or(0.0, |t| t.loss),
             skipped: accepted.is_some_and(|a| a.segments.is_empty()),
         };
-        self.dir.put(&file, &record)?;
+        self.dir.put_sealed(&file, &record)?;
         self.log(&record)?;
         self.progress.say(&format!(
             "iteration {iteration}: {} of {} trials, {:.1} minutes",
@@ -112,7 +113,7 @@ impl Run {
         for (direction, title) in
             [(Direction::Hard, "hard task, start"), (Direction::Easy, "easy task, start")]
         {
-            views.reset(direction, &mut stream(self.options.seed, "views", 0, 0))?;
+            rollout::reset(&mut views, direction, self.options.seed, "views", 0, 0)?;
             for camera in ["table", "wrist"] {
                 let image = views.render(camera, 320, 320)?;
                 pictures.views.push((format!("{camera} camera: {title}"), report::png_bytes(&image)?));

@@ -140,6 +140,7 @@ impl Stage {
             if step.is_multiple_of(every) || step == settings.steps {
                 say(a, format_args!("critic: step {step} of {}, loss {loss:.4}", settings.steps));
             }
+            std::ops::ControlFlow::Continue(())
         };
         let (critic, report) = train_critic(
             &network,

@@ -1,0 +1,140 @@
+use crate::{assert_success, nut_assembly, text};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+fn wait_for(path: &Path) {
+    for _ in 0..60_000 {
+        if path.exists() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    panic!("{} never came", path.display());
+}
+
+#[cfg(unix)]
+#[test]
+fn signals_save_the_training_state_and_end_with_their_status() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    let long = "--set=train.easy_steps=1000000";
+    let never = "--set=train.save_every=1000000";
+    for (signal, status) in [("-TERM", 143), ("-INT", 130)] {
+        let resume = out.exists();
+        let mut command = nut_assembly(&out, &[long, never]);
+        let child = command.args(resume.then_some("--resume")).stderr(Stdio::piped()).spawn().unwrap();
+        wait_for(&out.join("demonstrations"));
+        std::thread::sleep(Duration::from_millis(500));
+        assert!(Command::new("kill").args([signal, &child.id().to_string()]).status().unwrap().success());
+        let ended = child.wait_with_output().unwrap();
+        let words = text(&ended.stderr);
+        assert_eq!(ended.status.code(), Some(status), "{words}");
+        assert!(words.contains("--resume") && words.contains("SIG"), "{words}");
+        assert!(out.join("policy_easy/training.safetensors").exists());
+    }
+}
+
+#[test]
+fn words_that_cannot_be_written_stop_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let program = crate::example("nut_assembly").get_program().to_owned();
+    for (name, shell) in [("full", "\"$@\" 2>/dev/full >/dev/null"), ("closed", "\"$@\" 2>/dev/null | true")]
+    {
+        let out = dir.path().join(name);
+        let output = Command::new("bash")
+            .args(["-c", &format!("set -o pipefail; {shell}"), "bash"])
+            .arg(&program)
+            .args(["--preset", "smoke", "--out"])
+            .arg(&out)
+            .args(crate::SMALL)
+            .output()
+            .unwrap();
+        assert_success(&output);
+        assert!(out.join("report.html").exists(), "{name}");
+    }
+}
+
+fn first(folder: &Path, extension: &str) -> PathBuf {
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for path in std::fs::read_dir(folder).unwrap().flatten().map(|e| e.path()) {
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == extension) {
+                return path;
+            }
+        }
+    }
+    panic!("no .{extension} below {}", folder.display());
+}
+
+#[test]
+fn a_flipped_bit_in_what_a_run_reads_again_is_told_by_file_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    assert_success(&nut_assembly(&out, &[]).output().unwrap());
+    for path in [
+        first(&out.join("demonstrations/data"), "parquet"),
+        out.join("demonstrations/notes.json"),
+        out.join("iteration_00/record.json"),
+        out.join("iteration_00/policy/notes.json"),
+        out.join("iteration_01/segments/notes.json"),
+    ] {
+        let whole = std::fs::read(&path).unwrap();
+        // A digit, so that JSON stays JSON.
+        let at = (whole.len() / 2..whole.len()).find(|&i| whole[i].is_ascii_digit()).unwrap();
+        let mut flipped = whole.clone();
+        flipped[at] ^= 1;
+        std::fs::write(&path, flipped).unwrap();
+        let output = nut_assembly(&out, &["--resume"]).output().unwrap();
+        let words = text(&output.stderr);
+        assert!(!output.status.success(), "{} is used in silence", path.display());
+        assert!(words.contains(path.to_str().unwrap()) && words.contains("SHA-256"), "{words}");
+        std::fs::write(&path, whole).unwrap();
+    }
+    assert_success(&nut_assembly(&out, &["--resume"]).output().unwrap());
+}
+
+#[test]
+fn a_rate_at_which_nothing_is_learned_is_an_error() {
+    let dir = tempfile::tempdir().unwrap();
+    let arguments = [
+        "--set=train.step.schedule.lr=10",
+        "--set=train.easy_steps=300",
+        "--set=train.step.schedule.warmup=0",
+    ];
+    let output = nut_assembly(&dir.path().join("run"), &arguments).output().unwrap();
+    let words = text(&output.stderr);
+    assert!(!output.status.success() && words.contains("diverged") && words.contains("seed 0"), "{words}");
+}
+
+/// Calls `mju_error` at the tenth step.
+#[cfg(target_os = "linux")]
+const BREAKS: &str = r#"
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <stdatomic.h>
+static atomic_long count;
+void mj_step(const void *m, void *d) {
+    void (*real)(const void *, void *) = dlsym(RTLD_NEXT, "mj_step");
+    void (*error)(const char *, ...) = dlsym(RTLD_DEFAULT, "mju_error");
+    if (atomic_fetch_add(&count, 1) == 9) error("the stack is full");
+    real(m, d);
+}
+"#;
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_mujoco_that_cannot_go_on_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, library) = (dir.path().join("breaks.c"), dir.path().join("breaks.so"));
+    std::fs::write(&source, BREAKS).unwrap();
+    let mut built = Command::new("cc");
+    built.args(["-shared", "-fPIC", "-o"]).arg(&library).arg(&source).arg("-ldl");
+    assert!(built.status().unwrap().success());
+    let output = nut_assembly(&dir.path().join("run"), &[]).env("LD_PRELOAD", &library).output().unwrap();
+    let words = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(words.contains("MuJoCo cannot go on") && words.contains("the stack is full"), "{words}");
+}

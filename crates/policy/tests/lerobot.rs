@@ -2,6 +2,7 @@
 //! Whether LeRobot itself opens ours is for `tests/interop/run.sh`.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot be set up should fail")]
+#![allow(clippy::print_stdout, reason = "how far both are is worth reading when it fails")]
 
 use e2h_core::{Direction, Episode, Image, Observation, Origin};
 use e2h_data::{Normaliser, NormaliserConfig};

@@ -90,7 +90,7 @@ fn every_pair_has_a_program_and_a_configuration_of_its_own() {
     for name in auto_e2h::env::registry() {
         let read = |path: String| std::fs::read_to_string(root.join(&path)).expect(&path);
         let program = read(format!("examples/{name}.rs"));
-        assert!(program.contains(&format!("common::options(\"{name}\")")), "{name}");
+        assert!(program.contains(&format!("common::main(\"{name}\",")), "{name}");
         assert!(read(format!("configs/tasks/{name}.toml")).contains(&format!("name = \"{name}\"")));
     }
 }

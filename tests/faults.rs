@@ -96,19 +96,6 @@ fn a_flipped_bit_in_what_a_run_reads_again_is_told_by_file_name() {
     assert_success(&nut_assembly(&out, &["--resume"]).output().unwrap());
 }
 
-#[test]
-fn a_rate_at_which_nothing_is_learned_is_an_error() {
-    let dir = tempfile::tempdir().unwrap();
-    let arguments = [
-        "--set=train.step.schedule.lr=10",
-        "--set=train.easy_steps=300",
-        "--set=train.step.schedule.warmup=0",
-    ];
-    let output = nut_assembly(&dir.path().join("run"), &arguments).output().unwrap();
-    let words = text(&output.stderr);
-    assert!(!output.status.success() && words.contains("diverged") && words.contains("seed 0"), "{words}");
-}
-
 /// Calls `mju_error` at the tenth step.
 #[cfg(target_os = "linux")]
 const BREAKS: &str = r#"

@@ -43,7 +43,7 @@ again() { if [ -e "$1/run/run.json" ]; then e2h "$1" --resume; else e2h "$1"; fi
 draw() { drawn=$(((RANDOM << 15 | RANDOM) % $1)); }
 
 # Every file of a run and a checksum of it, without the times that it took and the machine's name.
-clocks='/"stage_minutes": \{$/,/\}/d; s/"(minutes|seconds|machine)": [^{}]*//'
+clocks='/"stage_minutes": \{$/,/\}/d; s/"(minutes|seconds|machine|sha256)": [^{}]*//'
 contents() {
     (cd "$1/run" && find . -type f | sort | while read -r file; do
         case "$file" in

@@ -379,3 +379,33 @@ impl Trainer {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_skipped_steps_in_a_row_end_a_training() {
+        let mut skipped = Skipped::default();
+        for step in 1..MOST_SKIPPED {
+            skipped.after(f32::INFINITY, step, 7).unwrap();
+        }
+        // One that counts, and the row begins anew.
+        skipped.after(3.0, MOST_SKIPPED, 7).unwrap();
+        for step in 1..MOST_SKIPPED {
+            skipped.after(f32::NAN, step, 7).unwrap();
+        }
+        let error = skipped.after(f32::INFINITY, 40, 7).unwrap_err();
+        assert!(matches!(error, Error::Skipped { steps: MOST_SKIPPED, step: 40, seed: 7, .. }), "{error}");
+    }
+
+    #[test]
+    fn weights_that_are_no_numbers_are_refused_by_name() {
+        let tensor = |v: f32| e2h_nn::HostTensor { shape: vec![2], data: vec![0.5, v] };
+        let weights: Weights =
+            [("a".to_owned(), tensor(1.0)), ("b".to_owned(), tensor(f32::INFINITY))].into();
+        assert!(matches!(sound(&weights, 3, 7), Err(Error::Weight { name, .. }) if name == "b"));
+        let weights: Weights = [("a".to_owned(), tensor(1.0))].into();
+        sound(&weights, 3, 7).unwrap();
+    }
+}

@@ -5,6 +5,7 @@ mod variant;
 
 use crate::expert::draw;
 use crate::pick_place::down;
+use crate::tabletop::Region;
 use crate::task::{Choice, Entry};
 use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
@@ -14,11 +15,6 @@ use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 use variant::{NUT_HALF_HEIGHT, PEG_TOP, VARIANTS, Variant, Yaw};
 
-/// Widening of the start box in which a nut that was put down counts as taken off, m.
-///
-/// Differs: TR-DRL's easy task ends with the nut held in the air; ours ends where the hard task starts, so that the
-/// reversed data show the grasp from the table. The margin forgives what a hand does when it lets go.
-const BOX_MARGIN: f64 = 0.02;
 /// Largest tilt of a nut that lies flat, as the cosine of its axis with the vertical (2.6 degrees).
 const FLAT: f64 = 0.999;
 /// How far above the nut the tool centre point has to be for the arm to count as away, m.
@@ -56,9 +52,12 @@ impl NutAssembly {
         Self { variant: Variant::named(choice.variant), demonstrator: choice.demonstrator }
     }
 
-    fn in_box(&self, p: &Vector3<f64>) -> bool {
-        let within = |v: f64, [low, high]: [f64; 2]| (low - BOX_MARGIN..=high + BOX_MARGIN).contains(&v);
-        within(p.x, self.variant.start_x) && within(p.y, self.variant.start_y)
+    /// Where the hard task starts, and where a nut that was put down counts as taken off.
+    ///
+    /// Differs: TR-DRL's easy task ends with the nut held in the air; ours ends where the hard task starts, so that the
+    /// reversed data show the grasp from the table.
+    fn start(&self) -> Region {
+        Region { x: self.variant.start_x, y: self.variant.start_y }
     }
 }
 
@@ -134,7 +133,7 @@ impl Task for NutAssembly {
             }
             Direction::Easy => {
                 let flat = (nut.orientation * Vector3::z()).z > FLAT && p.z < 2.0 * NUT_HALF_HEIGHT;
-                released && flat && self.in_box(&p) && sim.tcp().position.z - p.z > AWAY
+                released && flat && self.start().contains(&p) && sim.tcp().position.z - p.z > AWAY
             }
         }
     }
@@ -146,9 +145,7 @@ impl Task for NutAssembly {
     }
 
     fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
-        let margin = 0.75 * BOX_MARGIN;
-        let nearest = |v: f64, [low, high]: [f64; 2]| v.clamp(low - margin, high + margin);
-        Vector3::new(nearest(p.x, self.variant.start_x), nearest(p.y, self.variant.start_y), p.z)
+        self.start().nearest(p)
     }
 
     fn expert(&self, direction: Direction, config: &DemonstratorConfig, rng: &mut Rng) -> Box<dyn Expert> {

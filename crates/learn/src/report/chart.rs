@@ -53,26 +53,11 @@ fn series(axes: &Axes, run: &RunResults, colour: &str, name: &str, several: bool
     let points = run.iterations.iter().map(|r| (f64::from(r.iteration), rate(r)));
     let mut s = axes.line(points, &format!("stroke=\"{colour}\" stroke-width=\"2\" opacity=\".75\""));
     for r in &run.iterations {
-        let [lo, hi] = r.evaluation.wilson95;
-        let (x, y) = (axes.px(f64::from(r.iteration)), axes.py(rate(r)));
-        s += &format!(
-            "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{}, iteration {}: {}, 95% {} to {}</title>\
-             <path class=\"bar\" stroke-width=\"1.6\" d=\"M{x0} {hi}H{x1}M{x} {hi}V{lo}M{x0} {lo}H{x1}\"/>\
-             <circle cx=\"{x}\" cy=\"{y}\" r=\"4\"/></g>",
-            escape(name),
-            r.iteration,
-            fraction(r),
-            percent(lo),
-            percent(hi),
-            x0 = px(x - 4.0),
-            x1 = px(x + 4.0),
-            x = px(x),
-            y = px(y),
-            lo = px(axes.py(lo)),
-            hi = px(axes.py(hi)),
-        );
+        let title = format!("{name}, iteration {}: {}", r.iteration, fraction(r));
+        s += &axes.bar(f64::from(r.iteration), rate(r), r.evaluation.wilson95, colour, &title);
         if !several {
-            let (x, y) = (px(x), px(axes.py(hi) - 7.0));
+            let x = px(axes.px(f64::from(r.iteration)));
+            let y = px(axes.py(r.evaluation.wilson95[1]) - 7.0);
             s += &format!("<text class=\"mid b halo\" x=\"{x}\" y=\"{y}\">{}</text>", fraction(r));
         }
     }

@@ -1,6 +1,6 @@
 //! Success against the number of easy demonstrations, of many runs: does the loop make up for demonstrations?
 
-use super::svg::{Axes, colour, document, escape, legend, percent, px, ticks};
+use super::svg::{Axes, colour, document, legend, percent, ticks};
 use crate::record::{Evaluation, RunResults, wilson95};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -117,34 +117,19 @@ pub fn demonstration_curve(runs: &[&RunResults]) -> String {
             &format!("stroke=\"{c}\" stroke-width=\"2\"{dashes}"),
         );
         for (n, p) in own {
-            s += &bar(&moved, at(n), &p, c, &format!("{}, {n} demonstrations", line.name()));
+            let title = format!(
+                "{}, {n} demonstrations: {}/{}, {} run(s)",
+                line.name(),
+                p.successes,
+                p.trials,
+                p.runs
+            );
+            s += &moved.bar(at(n), p.rate(), wilson95(p.successes, p.trials), c, &title);
         }
         entries.push((line.name().to_owned(), c.to_owned()));
     }
     let (keys, taken) = legend(&entries, axes.left, axes.bottom() + 58.0, axes.width);
     document(WIDTH, axes.bottom() + 50.0 + taken, "Success by number of demonstrations", &(s + &keys))
-}
-
-fn bar(axes: &Axes, x: f64, p: &Point, colour: &str, name: &str) -> String {
-    let [lo, hi] = wilson95(p.successes, p.trials);
-    let (x, y) = (axes.px(x), axes.py(p.rate()));
-    format!(
-        "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{}: {}/{}, {} run(s), 95% {} to {}</title>\
-         <path class=\"bar\" stroke-width=\"1.6\" d=\"M{x0} {hi_y}H{x1}M{x} {hi_y}V{lo_y}M{x0} {lo_y}H{x1}\"/>\
-         <circle cx=\"{x}\" cy=\"{y}\" r=\"4\"/></g>",
-        escape(name),
-        p.successes,
-        p.trials,
-        p.runs,
-        percent(lo),
-        percent(hi),
-        x0 = px(x - 4.0),
-        x1 = px(x + 4.0),
-        x = px(x),
-        y = px(y),
-        hi_y = px(axes.py(hi)),
-        lo_y = px(axes.py(lo)),
-    )
 }
 
 /// The curve as a Markdown table: a row a number of demonstrations, k/n and interval a line.
@@ -175,7 +160,7 @@ pub fn table(runs: &[&RunResults]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample;
+    use super::super::{sample, svg::px};
     use super::*;
 
     fn run(demonstrations: usize, explored: bool, seed: u64) -> RunResults {

@@ -144,6 +144,25 @@ impl Axes {
         )
     }
 
+    /// A point with its interval [`lo`, `hi`] and a title that shows where a pointer rests.
+    pub(super) fn bar(&self, x: f64, y: f64, [lo, hi]: [f64; 2], colour: &str, title: &str) -> String {
+        let (x, y) = (self.px(x), self.py(y));
+        format!(
+            "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{}, 95% {} to {}</title>\
+             <path class=\"bar\" stroke-width=\"1.6\" d=\"M{x0} {hi_y}H{x1}M{x} {hi_y}V{lo_y}M{x0} {lo_y}H{x1}\"/>\
+             <circle cx=\"{x}\" cy=\"{y}\" r=\"4\"/></g>",
+            escape(title),
+            percent(lo),
+            percent(hi),
+            x0 = px(x - 4.0),
+            x1 = px(x + 4.0),
+            x = px(x),
+            y = px(y),
+            hi_y = px(self.py(hi)),
+            lo_y = px(self.py(lo)),
+        )
+    }
+
     /// A line through the points; a gap where one is not finite.
     pub(super) fn line(&self, points: impl Iterator<Item = (f64, f64)>, style: &str) -> String {
         let (mut d, mut pen) = (String::new(), 'M');

@@ -130,6 +130,17 @@ pub struct LoopConfig {
     pub explore: ExploreConfig,
 }
 
+/// What an update of the hard policy begins with.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum UpdateFrom {
+    /// The policy before it (the paper's).
+    #[default]
+    Policy,
+    /// Fresh weights: it learns all data of the loop anew.
+    Scratch,
+}
+
 /// Training steps and how a step looks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -140,6 +151,9 @@ pub struct StageConfig {
     pub initial_steps: usize,
     /// Steps of each update.
     pub update_steps: usize,
+    /// What an update begins with. Checkpoints from before it have none.
+    #[serde(default)]
+    pub update_from: UpdateFrom,
     /// Steps of each update of the easy policy on its own successes; 0 leaves it as it is (the paper's). Checkpoints from before
     /// it have none.
     #[serde(default)]

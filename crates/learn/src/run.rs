@@ -6,7 +6,7 @@
 mod measure;
 
 use crate::collect::{Collected, collect};
-use crate::config::{Resolved, RunConfig};
+use crate::config::{Resolved, RunConfig, UpdateFrom};
 use crate::directory::{Directory, TRAINING, write_atomic};
 use crate::picture;
 use crate::record::{Collection, Reversal};
@@ -255,7 +255,8 @@ impl Run {
         self.train(&folder(0, "policy"), "train hard 0", Direction::Hard, 0, steps, base, data, None)
     }
 
-    /// Continues the hard policy on `D_h^(0)` and the accepted segments; with none it stays as it is.
+    /// Trains the hard policy on `D_h^(0)` and the accepted segments, from where it is or from fresh weights as
+    /// `train.update_from` says; with no segments it stays as it is.
     ///
     /// # Errors
     /// As [`Run::train_easy`].
@@ -267,6 +268,7 @@ impl Run {
         accepted: &[Arc<Episode>],
     ) -> Result<DiffusionPolicy> {
         let steps = if accepted.is_empty() { 0 } else { self.config().train.update_steps };
+        let fresh = steps > 0 && self.config().train.update_from == UpdateFrom::Scratch;
         let data = (&base.hard_training[..], accepted);
         let name = format!("train hard {iteration}");
         self.train(
@@ -277,7 +279,7 @@ impl Run {
             steps,
             base,
             data,
-            Some(policy),
+            (!fresh).then_some(policy),
         )
     }
 

@@ -231,6 +231,7 @@ const CHANGES: &[Change] = &[
     ("train.easy_steps", Ok((Train, "4"))),
     ("train.initial_steps", Ok((Train, "4"))),
     ("train.update_steps", Ok((Update, "4"))),
+    ("train.update_from", Ok((Update, "scratch"))),
     ("train.easy_update_steps", Ok((Refine, "1"))),
     ("train.save_every", Err("where a run can go on, which tests/resume.rs shows to change nothing")),
     ("train.normaliser_margin", Ok((Demonstrate, "0.2"))),

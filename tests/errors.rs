@@ -93,6 +93,45 @@ fn a_run_directory_is_never_overwritten() {
     fails(&mut evaluate(&policy), &["SHA-256"]);
 }
 
+/// A checkpoint states the configuration of its run: what the environment of an evaluation is built from.
+#[test]
+fn a_published_checkpoint_with_a_damaged_run_section_is_refused_by_name() {
+    let dir = tempfile::tempdir().unwrap();
+    let published = Path::new("checkpoints/nut_assembly");
+    let whole = std::fs::read_to_string(published.join("policy.json")).unwrap();
+    std::fs::copy(published.join("model.safetensors"), dir.path().join("model.safetensors")).unwrap();
+    let evaluate = |damage: &dyn Fn(&mut serde_json::Value)| {
+        let mut policy: serde_json::Value = serde_json::from_str(&whole).unwrap();
+        damage(&mut policy["provenance"]["run"]);
+        std::fs::write(dir.path().join("policy.json"), policy.to_string()).unwrap();
+        let mut command = example("evaluate");
+        command.args(["--trials", "1", "--checkpoint"]).arg(dir.path());
+        command
+    };
+    let place = dir.path().join("policy.json");
+    let place = place.to_str().unwrap();
+    assert_success(&evaluate(&|_| ()).output().unwrap());
+    let gone = |run: &mut serde_json::Value| drop(run["loop"].as_object_mut().unwrap().remove("cycles"));
+    fails(&mut evaluate(&gone), &[place, "run configuration", "missing field `cycles`"]);
+    let renamed = |run: &mut serde_json::Value| run["env"]["holdsteps"] = run["env"]["hold_steps"].take();
+    fails(&mut evaluate(&renamed), &[place, "run configuration", "holdsteps"]);
+    let text = |run: &mut serde_json::Value| run["loop"]["cycles"] = "4O".into();
+    fails(&mut evaluate(&text), &[place, "run configuration", "4O"]);
+    let impossible = |run: &mut serde_json::Value| run["env"]["home_noise_rad"] = (-1).into();
+    fails(&mut evaluate(&impossible), &[place, "run configuration", "env.home_noise_rad", "-1"]);
+    fails(&mut evaluate(&|run| *run = serde_json::Value::Null), &[place, "run configuration"]);
+}
+
+#[test]
+fn pictures_of_no_pixels_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    for size in ["0", "100000"] {
+        let mut gallery = example("gallery");
+        fails(gallery.args(["--size", size, "--out"]).arg(dir.path()), &["--size", size, "expected 1 to"]);
+    }
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+}
+
 #[test]
 fn every_program_has_a_version() {
     for name in ["nut_assembly", "evaluate", "experts", "view", "export", "publish", "env_step", "peer"] {

@@ -93,7 +93,53 @@ fn a_flipped_bit_in_what_a_run_reads_again_is_told_by_file_name() {
         assert!(words.contains(path.to_str().unwrap()) && words.contains("SHA-256"), "{words}");
         std::fs::write(&path, whole).unwrap();
     }
+    // The seal itself: its digest, and its name, without which the file would look like one that has none.
+    let notes = out.join("policy_easy/notes.json");
+    let whole = std::fs::read_to_string(&notes).unwrap();
+    for damaged in
+        [whole.replacen("sha256", "sha254", 1), whole.replacen("\"sha256\": \"", "\"sha256\": \"f", 1)]
+    {
+        std::fs::write(&notes, &damaged).unwrap();
+        let output = nut_assembly(&out, &["--resume"]).output().unwrap();
+        let words = text(&output.stderr);
+        assert!(!output.status.success() && words.contains(notes.to_str().unwrap()), "{words}");
+    }
+    std::fs::write(&notes, whole).unwrap();
+    let files = results_of(&out);
     assert_success(&nut_assembly(&out, &["--resume"]).output().unwrap());
+    // To the last digit of every number that was read and written again.
+    assert!(files == results_of(&out), "a resumed run writes other results");
+}
+
+fn results_of(run: &Path) -> [Vec<u8>; 2] {
+    ["results.json", "report.html"].map(|file| std::fs::read(run.join(file)).unwrap())
+}
+
+/// No stage reads pictures again, but the report shows them.
+#[test]
+fn a_damaged_picture_is_told_by_file_name_and_a_removed_one_is_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    // A reversal is accepted and shown, whatever becomes of its gripper.
+    let arguments =
+        ["--set=evaluation.filmed=1", "--set=refine.gate.enabled=false", "--set=env.horizon_easy=300"];
+    let arguments = [&arguments[..], &["--set=train.easy_steps=400", "--set=train.step.noises=1"]].concat();
+    let run = |resume: &[&str]| nut_assembly(&out, &[&arguments[..], resume].concat()).output().unwrap();
+    assert_success(&run(&[]));
+    for picture in ["iteration_00/rollouts.png", "iteration_01/filter.svg", "iteration_01/reversals.json"] {
+        let place = out.join(picture);
+        let whole = std::fs::read(&place).unwrap();
+        let mut flipped = whole.clone();
+        flipped[whole.len() / 2] ^= 1;
+        std::fs::write(&place, flipped).unwrap();
+        let output = run(&["--resume"]);
+        let words = text(&output.stderr);
+        assert!(!output.status.success(), "{picture} is used in silence");
+        assert!(words.contains(place.to_str().unwrap()) && words.contains("SHA-256"), "{words}");
+        std::fs::remove_file(&place).unwrap();
+        assert_success(&run(&["--resume"]));
+        std::fs::write(&place, whole).unwrap();
+    }
 }
 
 /// Calls `mju_error` at the tenth step.

@@ -46,6 +46,42 @@ fn a_run_killed_at_random_instants_ends_with_the_same_bytes_whatever_the_threads
 }
 
 #[test]
+fn a_run_of_a_version_with_other_keys_goes_on_where_a_default_says_how_and_is_refused_elsewhere() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    let resume = || nut_assembly(&out, &["--resume", "--set=loop.iterations=0"]).output().unwrap();
+    assert_success(&nut_assembly(&out, &["--set=loop.iterations=0"]).output().unwrap());
+    let place = out.join("config.toml");
+    let whole = std::fs::read_to_string(&place).unwrap();
+    let without = |key: &str| -> String {
+        let is = |line: &&str| line.split(" =").next() == Some(key);
+        assert_eq!(whole.lines().filter(is).count(), 1, "{key} in {whole}");
+        whole.lines().filter(|line| !is(line)).flat_map(|line| [line, "\n"]).collect()
+    };
+    let unknown = whole.replace("[loop]\n", "[loop]\nforgotten = 1\n");
+    for (config, word) in [(without("cycles"), "cycles"), (unknown, "forgotten")] {
+        std::fs::write(&place, &config).unwrap();
+        let output = resume();
+        let words = crate::text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{words}");
+        for word in ["config.toml", "expected one of this version", word] {
+            assert!(words.contains(word), "expected `{word}` in: {words}");
+        }
+        assert_eq!(words.lines().count(), 1, "{words}");
+        assert_eq!(std::fs::read_to_string(&place).unwrap(), config, "a refused run was changed");
+    }
+    // Came with a default; and values count, not how they are written.
+    for config in
+        [without("update_from"), whole.replace("update_from = \"policy\"", "update_from = 'policy'")]
+    {
+        assert_ne!(config, whole);
+        std::fs::write(&place, config).unwrap();
+        assert_success(&resume());
+        assert_eq!(std::fs::read_to_string(&place).unwrap(), whole);
+    }
+}
+
+#[test]
 fn a_run_made_longer_goes_on_as_if_it_had_been_that_long() {
     let dir = tempfile::tempdir().unwrap();
     let (whole, longer) = (dir.path().join("whole"), dir.path().join("longer"));

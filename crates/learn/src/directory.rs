@@ -100,6 +100,10 @@ fn hex(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
 
+fn holds_digest(line: &str) -> bool {
+    line.split(|c: char| !c.is_ascii_hexdigit()).any(|word| word.len() == 64)
+}
+
 pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
     let path = path.to_owned();
     move |source| Error::Io { doing, path, source }
@@ -123,14 +127,13 @@ enum Difference {
     More,
 }
 
-fn difference(written: &str, given: &Resolved) -> Difference {
-    let Ok(written) = RunConfig::from_text(&given.preset, written) else { return Difference::More };
-    let (mut a, b) = (written.config, &given.config);
+fn difference(written: &str, given: &Resolved) -> Result<Difference> {
+    let (mut a, b) = (RunConfig::from_text(&given.preset, written)?.config, &given.config);
     if a == *b {
-        return Difference::None;
+        return Ok(Difference::None);
     }
     a.closed_loop.iterations = b.closed_loop.iterations;
-    if a == *b { Difference::Iterations } else { Difference::More }
+    Ok(if a == *b { Difference::Iterations } else { Difference::More })
 }
 
 impl Directory {
@@ -180,14 +183,22 @@ impl Directory {
         }
         if found != identity {
             let text = |i: &Identity| format!("{} {} seed {}", i.task, i.preset, i.seed);
-            return differs("run", text(&identity), text(&found));
+            return differs("run.json", text(&identity), text(&found));
         }
         let config = path.join("config.toml");
         let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;
-        match difference(&text, resolved) {
-            Difference::None => {}
+        // What later versions added has a default, which is what was done before. Where a key has none, or is gone, no value of
+        // ours is what the run was begun with.
+        let difference = difference(&text, resolved).map_err(|e| Error::Foreign {
+            path: config.clone(),
+            quantity: "configuration".to_owned(),
+            expected: "one of this version (a run ends with the version that began it)".to_owned(),
+            found: e.to_string(),
+        })?;
+        match difference {
+            Difference::None if text == resolved.text => {}
             // A run can be made longer (or shorter): no stage that is done depends on how many follow.
-            Difference::Iterations => write_atomic(&config, resolved.text.as_bytes())?,
+            Difference::None | Difference::Iterations => write_atomic(&config, resolved.text.as_bytes())?,
             Difference::More => {
                 let line = resolved.text.lines().zip(text.lines()).find(|(a, b)| a != b);
                 let (expected, found) = line.unwrap_or(("the configuration given", "another one"));
@@ -232,6 +243,18 @@ impl Directory {
     pub(crate) fn verify(&self, name: &str, sha256: Option<&str>) -> Result<()> {
         let Some(expected) = sha256 else { return Ok(()) };
         self.compare(name, expected, self.sha256(name)?)
+    }
+
+    /// SHA-256 of those of the files that are there, by their names.
+    pub(crate) fn seals(&self, names: &[String]) -> Result<BTreeMap<String, String>> {
+        let there = names.iter().filter(|name| self.join(name).exists());
+        there.map(|name| Ok((name.clone(), self.sha256(name)?))).collect()
+    }
+
+    /// Refuses damage to files beside a result, such as pictures. No stage needs them, so one that was removed is no damage.
+    pub(crate) fn verify_seals(&self, seals: &BTreeMap<String, String>) -> Result<()> {
+        let mut there = seals.iter().filter(|(name, _)| self.join(name).exists());
+        there.try_for_each(|(name, sum)| self.verify(name, Some(sum)))
     }
 
     fn compare(&self, name: &str, expected: &str, found: String) -> Result<()> {
@@ -302,6 +325,12 @@ impl Directory {
             Some((seal, rest)) => {
                 self.compare(name, seal, hex(rest.as_bytes()))?;
                 format!("{{\n{rest}")
+            }
+            // Nothing but sums begins with a digest: the seal itself is damaged.
+            None if !name.ends_with(FILES) && text.lines().nth(1).is_some_and(holds_digest) => {
+                let found = text.lines().nth(1).unwrap_or_default().trim().to_owned();
+                let (quantity, expected) = ("seal".to_owned(), "\"sha256\"".to_owned());
+                return Err(Error::Foreign { path, quantity, expected, found });
             }
             None => text,
         };

@@ -28,7 +28,7 @@ impl Published {
     pub fn open(dir: &Path) -> Result<Self> {
         let (policy, checkpoint) = DiffusionPolicy::load(dir)?;
         let foreign = |quantity: &str, expected: &str, found: String| Error::Foreign {
-            path: dir.to_owned(),
+            path: dir.join("policy.json"),
             quantity: quantity.to_owned(),
             expected: expected.to_owned(),
             found,

@@ -88,6 +88,9 @@ pub struct Accepted {
 struct AcceptedNotes {
     collection: Collection,
     stage_minutes: BTreeMap<String, f64>,
+    /// SHA-256 of what lies beside the segments. Runs of version 0.1 have none.
+    #[serde(default)]
+    files: BTreeMap<String, String>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -425,6 +428,7 @@ impl Run {
     /// When the folder cannot be read.
     pub fn stored(&self, iteration: u32) -> Result<Option<Accepted>> {
         let found = self.dir.get_episodes::<AcceptedNotes>(&folder(iteration, "segments"))?;
+        found.iter().try_for_each(|(_, notes)| self.dir.verify_seals(&notes.files))?;
         Ok(found.map(|(segments, notes)| Accepted {
             segments: segments.into_iter().map(Arc::new).collect(),
             collection: notes.collection,
@@ -613,7 +617,8 @@ impl Run {
             ("refine".to_owned(), refine_minutes),
             ("critic".to_owned(), critic_minutes),
         ]);
-        let stored = AcceptedNotes { collection, stage_minutes };
+        let files = self.dir.seals(&["filter.svg", "reversals.json"].map(|f| folder(iteration, f)))?;
+        let stored = AcceptedNotes { collection, stage_minutes, files };
         self.dir.put_episodes(&folder(iteration, "segments"), &segments, &stored)?;
         Ok(Accepted { segments: segments.into_iter().map(Arc::new).collect(), collection: stored.collection })
     }

@@ -10,8 +10,19 @@ use crate::rollout;
 use crate::view::scalars;
 use e2h_core::{Direction, Episode};
 use e2h_policy::DiffusionPolicy;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+
+/// What `record.json` holds.
+#[derive(Serialize, Deserialize)]
+struct Measured {
+    #[serde(flatten)]
+    record: IterationRecord,
+    /// SHA-256 of what lies beside it. Runs of version 0.1 have none.
+    #[serde(default)]
+    files: BTreeMap<String, String>,
+}
 
 impl Run {
     /// Measures the hard policy and appends its row to the record.
@@ -25,7 +36,8 @@ impl Run {
         accepted: Option<&Accepted>,
     ) -> Result<IterationRecord> {
         let file = folder(iteration, "record.json");
-        if let Some(record) = self.dir.get(&file)? {
+        if let Some(Measured { record, files }) = self.dir.get(&file)? {
+            self.dir.verify_seals(&files)?;
             self.log(&record)?;
             return Ok(record);
         }
@@ -70,7 +82,10 @@ impl Run {
             loss: trained.map_or(0.0, |t| t.loss),
             skipped: accepted.is_some_and(|a| a.segments.is_empty()),
         };
-        self.dir.put_sealed(&file, &record)?;
+        let files = self.dir.seals(&[folder(iteration, "rollouts.png")])?;
+        let measured = Measured { record, files };
+        self.dir.put_sealed(&file, &measured)?;
+        let record = measured.record;
         self.log(&record)?;
         self.progress.say(&format!(
             "iteration {iteration}: {} of {} trials, {:.1} minutes",

@@ -7,9 +7,8 @@
 //! Reads the `results.json` of runs (files, or folders with such files in them), writes `curve.svg` beside the first, and prints
 //! the table.
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 use anyhow::{Context as _, bail};
+use auto_e2h::core::say;
 use auto_e2h::learn::record::RunResults;
 use auto_e2h::learn::report::{self, curve};
 use clap::Parser;
@@ -53,8 +52,8 @@ fn program() -> anyhow::Result<()> {
     });
     let runs: Vec<&RunResults> = runs.iter().collect();
     report::write_svg(&out, &curve::demonstration_curve(&runs))?;
-    println!("{}", curve::table(&runs));
-    println!("{} runs: {}", runs.len(), out.display());
+    say(curve::table(&runs))?;
+    say(format_args!("{} runs: {}", runs.len(), out.display()))?;
     Ok(())
 }
 

@@ -4,10 +4,8 @@
 //! cargo run --release --example env_step -- --px 128 --json
 //! ```
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 use anyhow::bail;
-use auto_e2h::core::{Action, Direction, Origin, stream};
+use auto_e2h::core::{Action, Direction, Origin, say, stream};
 use auto_e2h::env::{DemonstratorConfig, Env, EnvConfig, TaskOptions, demonstrate, task};
 use clap::Parser;
 use std::path::PathBuf;
@@ -100,17 +98,14 @@ fn program() -> anyhow::Result<()> {
     let rate = (a.steps * a.threads) as f64 / start.elapsed().as_secs_f64();
     if a.json {
         let rate = (10.0 * rate).round() / 10.0;
-        println!(
-            "{}",
-            serde_json::json!({
-                "peer": "auto-e2h", "what": a.task, "px": a.px, "threads": a.threads, "control_steps_per_s": rate
-            })
-        );
+        say(serde_json::json!({
+            "peer": "auto-e2h", "what": a.task, "px": a.px, "threads": a.threads, "control_steps_per_s": rate
+        }))?;
     } else {
-        println!(
+        say(format_args!(
             "{}: {rate:.1} control steps a second, two images of {1} x {1} each, {2} thread(s)",
             a.task, a.px, a.threads
-        );
+        ))?;
     }
     Ok(())
 }

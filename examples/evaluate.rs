@@ -4,9 +4,8 @@
 //! cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7
 //! ```
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 use anyhow::{Context as _, ensure};
+use auto_e2h::core::say;
 use auto_e2h::learn::{Filmed, Filming, Progress, Published, evaluate, hub, report};
 use auto_e2h::nn::Compute;
 use clap::Parser;
@@ -80,17 +79,17 @@ fn program() -> anyhow::Result<()> {
             "wilson95": result.wilson95,
             "seconds": result.seconds,
         });
-        println!("{line}");
+        say(line)?;
     } else {
         let [lo, hi] = result.wilson95;
-        println!(
+        say(format_args!(
             "{task} ({direction}): {} of {} trials succeeded, 95 % Wilson interval {:.0} to {:.0} %, {:.0} s",
             result.successes,
             result.trials,
             lo * 100.0,
             hi * 100.0,
             result.seconds
-        );
+        ))?;
     }
     Ok(())
 }

@@ -7,11 +7,10 @@
 //! be; policies that hold `still` or draw `random` goal poses. Then the deepest contact of anything with anything while goals are
 //! drawn every step (trembling) and every 20 steps (sweeping, with all the force that the arm has), and control steps a second
 //! with both cameras. About a minute a pair on two cores. `--json` prints one line a variant and nothing else.
-#![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::Result;
 use clap::Parser;
-use e2h_core::{Direction, Episode, Origin, Outcome, stream};
+use e2h_core::{Direction, Episode, Origin, Outcome, say, stream};
 use e2h_env::{
     Blind, Env, EnvConfig, Task, TaskOptions, demonstrate, probe, registry, replay, task, variants,
 };
@@ -96,9 +95,9 @@ fn program() -> Result<()> {
     };
     let n = arguments.trials;
     if !arguments.json {
-        println!(
+        say(format_args!(
             "of {n} trials, hard/easy     experts  replay   starts  still  random  trembling/sweeping, mm  steps/s"
-        );
+        ))?;
     }
     for name in &names {
         let (c, speed) = measure(name, &arguments)?;
@@ -114,10 +113,10 @@ fn program() -> Result<()> {
                 "steps_per_second": speed.round(), "image_size": SPEED.0,
                 "mean_rows_hard": c.rows[0] / n.max(1) as usize, "mean_rows_easy": c.rows[1] / n.max(1) as usize,
             });
-            println!("{line}");
+            say(line)?;
         } else {
             let two = |[hard, easy]: [u32; 2]| format!("{hard}/{easy}");
-            println!(
+            say(format_args!(
                 "{name:<26} {:>9} {:>7} {:>8} {:>6} {:>7} {:>12.2}/{:<8.2} {speed:>10.0}",
                 two(c.experts),
                 c.replay,
@@ -126,9 +125,12 @@ fn program() -> Result<()> {
                 two(c.random),
                 c.deepest[0] * 1e3,
                 c.deepest[1] * 1e3,
-            );
+            ))?;
             if c.diverged + c.through_table > 0 {
-                println!("{:<26} {} diverged, {} fell through the table", "", c.diverged, c.through_table);
+                say(format_args!(
+                    "{:<26} {} diverged, {} fell through the table",
+                    "", c.diverged, c.through_table
+                ))?;
             }
         }
     }

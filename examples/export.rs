@@ -8,9 +8,8 @@
 //! Needs neither Python nor LeRobot. What LeRobot cannot express is listed, and nothing is written then. Policies of
 //! `--preset paper --set policy.lerobot_alignment=true --set policy.n_action_steps=8` go both ways.
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 use anyhow::{Context, bail};
+use auto_e2h::core::say;
 use auto_e2h::policy::lerobot;
 use clap::Parser;
 use std::path::{Path, PathBuf};
@@ -52,14 +51,14 @@ fn program() -> anyhow::Result<()> {
 fn to_lerobot(from: &Path, to: &Path, json: bool) -> anyhow::Result<()> {
     let done = lerobot::export(from, to)?;
     if json {
-        println!("{}", serde_json::json!({"lerobot": to, "files": done.files, "notes": done.notes}));
+        say(serde_json::json!({"lerobot": to, "files": done.files, "notes": done.notes}))?;
         return Ok(());
     }
-    println!("{}: {}", to.display(), done.files.join(", "));
+    say(format_args!("{}: {}", to.display(), done.files.join(", ")))?;
     for note in &done.notes {
-        println!("note: {note}");
+        say(format_args!("note: {note}"))?;
     }
-    println!("LeRobot: DiffusionPolicy.from_pretrained(\"{}\")", to.display());
+    say(format_args!("LeRobot: DiffusionPolicy.from_pretrained(\"{}\")", to.display()))?;
     Ok(())
 }
 
@@ -73,16 +72,13 @@ fn from_lerobot(from: &Path, to: &Path, json: bool) -> anyhow::Result<()> {
     let (policy, provenance) = opened.into_policy()?;
     policy.save(to, &provenance).with_context(|| to.display().to_string())?;
     if json {
-        println!(
-            "{}",
-            serde_json::json!({"out": to, "parameters": policy.parameters(), "config": policy.config()})
-        );
+        say(serde_json::json!({"out": to, "parameters": policy.parameters(), "config": policy.config()}))?;
         return Ok(());
     }
-    println!(
+    say(format_args!(
         "{}: {} parameters, state of {state}, action of {action}, cameras {cameras:?}",
         to.display(),
         policy.parameters()
-    );
+    ))?;
     Ok(())
 }

@@ -4,12 +4,11 @@
 //! cargo run --release --example peer -- --size laptop --json
 //! ```
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 #[path = "../benches/peers/workload.rs"]
 mod workload;
 
 use anyhow::bail;
+use auto_e2h::core::say;
 use auto_e2h::nn::candle_core::Tensor;
 use auto_e2h::nn::{Compute, Precision, candle_operations};
 use clap::Parser;
@@ -127,29 +126,30 @@ fn measure(a: &Arguments) -> anyhow::Result<()> {
     let (size, batch, params) = (a.size.name(), work.batch(), work.parameters());
     let (loss, peak) = (first.unwrap_or(f32::NAN), peak_mb());
     if a.json {
-        println!(
-            "{}",
-            serde_json::json!({
+        say(serde_json::json!({
                 "peer": concat!("auto-e2h ", env!("CARGO_PKG_VERSION")), "variant": "default", "size": size,
                 "device": compute.name(), "tf32": a.tf32, "bf16": a.bf16, "batch": batch, "threads": a.threads, "params": params, "forward": forward,
                 "step": step, "ddim1": ddim1, "ddim8": ddim8, "rss_mb": peak, "loss": loss,
-            })
-        );
+        }))?;
     } else {
-        println!("{size}: {params} parameters, batch {batch}, {} thread(s), {}", a.threads, compute.name());
-        println!("  training step      {step:8.2} ms   (loss of the first {loss:.6})");
-        println!("  forward            {forward:8.2} ms");
-        println!("  sampling, 1        {ddim1:8.2} ms");
-        println!("  sampling, 8        {ddim8:8.2} ms");
-        println!("  peak memory        {:8} MB", peak.unwrap_or(0));
+        say(format_args!(
+            "{size}: {params} parameters, batch {batch}, {} thread(s), {}",
+            a.threads,
+            compute.name()
+        ))?;
+        say(format_args!("  training step      {step:8.2} ms   (loss of the first {loss:.6})"))?;
+        say(format_args!("  forward            {forward:8.2} ms"))?;
+        say(format_args!("  sampling, 1        {ddim1:8.2} ms"))?;
+        say(format_args!("  sampling, 8        {ddim8:8.2} ms"))?;
+        say(format_args!("  peak memory        {:8} MB", peak.unwrap_or(0)))?;
         if a.roofline {
             let (product, reached) = (product_rate(a.repeats, &compute)?, work.step_flop() / (1e-3 * step));
-            println!("  matrix product     {:8.1} GFLOP/s", 1e-9 * product);
-            println!(
+            say(format_args!("  matrix product     {:8.1} GFLOP/s", 1e-9 * product))?;
+            say(format_args!(
                 "  training step      {:8.1} GFLOP/s, {:.0} % of it",
                 1e-9 * reached,
                 100.0 * reached / product
-            );
+            ))?;
         }
     }
     Ok(())

@@ -4,8 +4,7 @@
 //! HF_TOKEN=... cargo run --release --features hub --example publish -- --repo me/nut runs/nut_assembly-laptop-0/iteration_03/policy
 //! ```
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
+use auto_e2h::core::say;
 use auto_e2h::learn::hub::{Address, Publication, Settings, publish};
 use clap::Parser;
 use std::path::PathBuf;
@@ -34,6 +33,5 @@ fn main() -> Result<(), auto_e2h::core::Failure> {
 fn program() -> anyhow::Result<()> {
     let a = Arguments::parse();
     let publication = Publication { address: a.repo, dir: a.dir, private: a.private, license: a.license };
-    println!("{}", publish(&publication, &Settings::from_env())?);
-    Ok(())
+    Ok(say(publish(&publication, &Settings::from_env())?)?)
 }

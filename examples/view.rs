@@ -5,8 +5,7 @@
 //! cargo run --release --example view -- recordings/unplug --out unplug.html --episodes 50
 //! ```
 
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
+use auto_e2h::core::say;
 use auto_e2h::data::lerobot::ColumnSlice;
 use auto_e2h::learn::view::{Options, VIEW_FILE, write, write_scalars};
 use clap::Parser;
@@ -49,22 +48,23 @@ fn program() -> anyhow::Result<()> {
     let options =
         Options { episodes: a.episodes, stride: a.stride, megabytes: a.megabytes, position: a.position };
     let page = write(&a.dir, &out, &options)?;
-    println!(
-        "{}: {} of {} episodes, {:.1} MB",
-        page.path.display(),
-        page.shown,
-        page.episodes,
-        page.bytes as f64 / 1e6
-    );
-    for line in page.left_out {
-        println!("  {line}");
-    }
+    let mut values = None;
     if let Some(folder) = a.tensorboard {
         // What was measured is dated by its own files, not by the moment of looking at it.
         let files = ["results.json", "run.json", "meta/info.json"].map(|f| a.dir.join(f));
         let time = files.iter().find_map(|f| f.metadata().ok()?.modified().ok()).unwrap_or(UNIX_EPOCH);
         let time = time.duration_since(UNIX_EPOCH)?.as_secs_f64();
-        println!("{}: {} values", folder.display(), write_scalars(&a.dir, &folder, time)?);
+        values = Some(format!("{}: {} values", folder.display(), write_scalars(&a.dir, &folder, time)?));
     }
-    Ok(())
+    say(format_args!(
+        "{}: {} of {} episodes, {:.1} MB",
+        page.path.display(),
+        page.shown,
+        page.episodes,
+        page.bytes as f64 / 1e6
+    ))?;
+    for line in page.left_out {
+        say(format_args!("  {line}"))?;
+    }
+    Ok(values.map_or(Ok(()), say)?)
 }

@@ -55,6 +55,116 @@ fn words_that_cannot_be_written_stop_nothing() {
     }
 }
 
+/// Every program that prints, with little to do. NEW is a folder of its own; RUN, SET and OURS are a finished run, recordings and a
+/// checkpoint that LeRobot can have.
+const PROGRAMS: [(&str, &str); 15] = [
+    ("nut_assembly", "--preset smoke --quiet --resume --out RUN SMALL"),
+    ("curve", "RUN --out NEW/curve.svg"),
+    ("dataset", "check SET"),
+    ("env_step", "--task disk --px 16 --steps 5"),
+    ("evaluate", "--checkpoint RUN/iteration_00/policy --trials 1"),
+    ("experts", "--task disk --trials 1"),
+    ("export", "--checkpoint OURS --lerobot NEW/lerobot"),
+    ("flat_memory", "1"),
+    ("gallery", "--task disk --size 16 --out NEW"),
+    ("interop", "write NEW/set"),
+    ("mixed_network", ""),
+    ("peer", "--batch 1 --repeats 1 --threads 1"),
+    ("refine", "--dataset SET --out NEW/refined --pose observation.state[0:7] --rotation wxyz --task back"),
+    ("speed", "1 nothing"),
+    ("view", "RUN --out NEW/page.html --tensorboard NEW/events"),
+];
+/// The other pairs are run by what runs `nut_assembly`; `publish` needs a hub; `lerobot_actions` prints nothing.
+const OTHERS: [&str; 11] = [
+    "brush",
+    "cube_pick_place",
+    "cube_stack",
+    "cylinder_pick_place",
+    "disk",
+    "lerobot_actions",
+    "mouse",
+    "peg_insertion",
+    "publish",
+    "rod_insertion",
+    "test_tube",
+];
+
+#[test]
+fn every_program_is_tried_with_outputs_that_take_nothing() {
+    let mut there = vec![];
+    let crates = std::fs::read_dir("crates").unwrap().flatten().map(|e| e.path().join("examples"));
+    for folder in crates.chain([PathBuf::from("examples")]).filter(|folder| folder.exists()) {
+        for path in std::fs::read_dir(folder).unwrap().flatten().map(|e| e.path()) {
+            if path.extension().is_some_and(|e| e == "rs") || path.join("main.rs").exists() {
+                there.push(path.file_stem().unwrap().to_str().unwrap().to_owned());
+            }
+        }
+    }
+    there.sort_unstable();
+    let mut listed: Vec<&str> = PROGRAMS.iter().map(|p| p.0).chain(OTHERS).collect();
+    listed.sort_unstable();
+    assert_eq!(there, listed);
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn closed_pipes_end_programs_quietly_and_full_disks_with_a_message() {
+    let dir = tempfile::tempdir().unwrap();
+    let (run, set) = (dir.path().join("run"), dir.path().join("run/demonstrations"));
+    assert_success(&nut_assembly(&run, &[]).output().unwrap());
+    let ours = dir.path().join("ours");
+    let for_lerobot = "lerobot_alignment=true n_action_steps=8 n_image_steps=2 relative_features=false encoder_width=64 \
+                       encoder_blocks=[2,2,2,2] image_features=8";
+    let mut arguments: Vec<String> =
+        for_lerobot.split_whitespace().map(|v| format!("--set=policy.{v}")).collect();
+    arguments.extend(["--set=train.step.conditions=2", "--set=loop.iterations=0"].map(str::to_owned));
+    assert_success(&nut_assembly(&ours, &[]).args(arguments).output().unwrap());
+
+    let tried = |name: &str, arguments: &str| {
+        let new = tempfile::tempdir_in(dir.path()).unwrap();
+        let place = |text: &str| {
+            let places = [("NEW", new.path()), ("RUN", &run), ("SET", &set)];
+            let text = text.replace("OURS", ours.join("iteration_00/policy").to_str().unwrap());
+            places.iter().fold(text, |text, (word, path)| text.replace(word, path.to_str().unwrap()))
+        };
+        let mut command = crate::example(name);
+        for argument in arguments.split_whitespace() {
+            if argument == "SMALL" {
+                command.args(crate::SMALL)
+            } else {
+                command.arg(place(argument))
+            };
+        }
+        (command, new)
+    };
+    let full = || std::fs::File::options().write(true).open("/dev/full").unwrap();
+    let closed = || std::io::pipe().unwrap().1;
+    for (name, arguments) in PROGRAMS {
+        let (mut command, _new) = tried(name, arguments);
+        let output = command.stdout(closed()).output().unwrap();
+        let words = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(0), "{name} behind a closed pipe: {words}");
+        assert!(!words.contains("rror") && !words.contains("panicked"), "{name}: {words}");
+
+        let (mut command, _new) = tried(name, arguments);
+        let output = command.stdout(full()).output().unwrap();
+        let words = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{name} with a full disk: {words}");
+        assert!(words.contains("standard output") && !words.contains("panicked"), "{name}: {words}");
+
+        let (mut command, _new) = tried(name, arguments);
+        let output = command.stderr(full()).output().unwrap();
+        assert_eq!(output.status.code(), Some(0), "{name} with words that go nowhere");
+        assert!(!output.stdout.is_empty(), "{name} prints nothing");
+    }
+
+    // Here the status is what was asked for, whoever reads.
+    std::fs::write(first(&set.join("data"), "parquet"), "damage").unwrap();
+    let (mut command, _new) = tried("dataset", "check SET");
+    let output = command.stdout(closed()).output().unwrap();
+    assert_eq!((output.status.code(), text(&output.stderr)), (Some(1), String::new()));
+}
+
 fn first(folder: &Path, extension: &str) -> PathBuf {
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {

@@ -6,10 +6,8 @@
 //! cargo run --release -p e2h-data --example interop -- dump DIR
 //! cargo run --release -p e2h-data --example interop -- images DIR OUT
 //! ```
-#![allow(clippy::print_stdout, reason = "what an example is for")]
-
 use anyhow::{Context, Result, bail};
-use e2h_core::{Direction, Episode, Frames, Observation, Origin, Outcome};
+use e2h_core::{Direction, Episode, Frames, Observation, Origin, Outcome, say};
 use e2h_data::lerobot::{Column, Dataset, Writer, features_of};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
@@ -69,8 +67,7 @@ fn write(dir: &str) -> Result<()> {
         }
     }
     let info = writer.finish()?;
-    println!("wrote {} episodes, {} frames", info.total_episodes, info.total_frames);
-    Ok(())
+    Ok(say(format_args!("wrote {} episodes, {} frames", info.total_episodes, info.total_frames))?)
 }
 
 /// The first episode again, whatever the columns are.
@@ -82,8 +79,7 @@ fn append(dir: &str) -> Result<()> {
     let mut writer = Writer::append(dir)?;
     writer.push(&table, "once more")?;
     let info = writer.finish()?;
-    println!("appended: {} episodes, {} frames", info.total_episodes, info.total_frames);
-    Ok(())
+    Ok(say(format_args!("appended: {} episodes, {} frames", info.total_episodes, info.total_frames))?)
 }
 
 /// Every number, and the SHA-256 of every image's pixels, one JSON line an episode.
@@ -104,7 +100,7 @@ fn dump(dir: &str) -> Result<()> {
         }
         let line =
             json!({"episode": i, "rows": table.rows, "tasks": dataset.row_tasks(i)?, "columns": columns});
-        println!("{line}");
+        say(line)?;
     }
     Ok(())
 }

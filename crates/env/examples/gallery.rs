@@ -5,11 +5,10 @@
 //! cargo run --release --example gallery                               # into runs/gallery
 //! cargo run --release --example gallery -- --out crates/env/pictures  # what the README shows
 //! ```
-#![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::{Context, Result};
 use clap::Parser;
-use e2h_core::{Direction, Image, stream};
+use e2h_core::{Direction, Image, say, stream};
 use e2h_env::{DemonstratorConfig, Env, EnvConfig, MOST_PIXELS, Style, TaskOptions, registry, task};
 use std::path::{Path, PathBuf};
 
@@ -51,11 +50,15 @@ fn program() -> Result<()> {
         Some(name) => vec![name],
         None => registry().to_vec(),
     };
+    let mut written = vec![];
     for name in names {
         let path = arguments.out.join(format!("{name}.png"));
         let columns = draw(name, arguments.size, arguments.seed)?;
         write(&path, &columns).with_context(|| format!("writing {}", path.display()))?;
-        println!("{}", path.display());
+        written.push(path);
+    }
+    for path in written {
+        say(path.display())?;
     }
     Ok(())
 }

@@ -1,8 +1,6 @@
 //! Shows that a warm training step takes no more memory: resident set at step 200 and at the last.
 //!
 //! `cargo run --release -p e2h-nn --example flat_memory [steps]`
-#![allow(clippy::print_stdout, reason = "an example prints")]
-
 use candle_core::{Device, Tensor};
 use e2h_nn::{
     Adam, AdamConfig, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, RgbEncoder, RgbEncoderConfig,
@@ -60,7 +58,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         if step == 20 || step == 200 || step == steps {
             let (mb, faults) = memory();
             let each = start.elapsed().as_secs_f64() * 1e3 / step as f64;
-            println!("step {step}: {mb:.1} MB resident, {faults} page faults, {each:.1} ms a step");
+            e2h_core::say(format_args!(
+                "step {step}: {mb:.1} MB resident, {faults} page faults, {each:.1} ms a step"
+            ))?;
         }
     }
     Ok(())

@@ -5,8 +5,6 @@
 //! ```
 //!
 //! It ends with an error of about 0.06, of frequencies from 1 to 6. (candle-nn's own `Conv1d` would learn from a wrong gradient.)
-#![allow(clippy::print_stdout, reason = "an example prints")]
-
 use e2h_nn::candle_core::{DType, Device, Module, Result, Tensor};
 use e2h_nn::candle_nn::{self, VarBuilder, VarMap};
 use e2h_nn::rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
@@ -65,7 +63,7 @@ fn main() -> std::result::Result<(), Box<dyn std::error::Error>> {
         let loss = mse(&net.forward(&x)?, &y, None)?;
         adam.step(&params, &backward(&loss, &params)?, 2e-3)?;
         if step % 200 == 0 {
-            println!("step {step:3}  loss {:.4}", loss.to_scalar::<f32>()?);
+            e2h_core::say(format_args!("step {step:3}  loss {:.4}", loss.to_scalar::<f32>()?))?;
         }
     }
 
@@ -76,6 +74,6 @@ fn main() -> std::result::Result<(), Box<dyn std::error::Error>> {
     copy.import_from(&VarBuilder::from_varmap(&map, DType::F32, &Device::Cpu))?;
     let (x, y) = waves(256, &mut rng)?;
     let error = (acting.forward(&x)? - y)?.sqr()?.mean_all()?.sqrt()?.to_scalar::<f32>()?;
-    println!("{} parameters, error {error:.3}", map.all_vars().len());
+    e2h_core::say(format_args!("{} parameters, error {error:.3}", map.all_vars().len()))?;
     Ok(())
 }

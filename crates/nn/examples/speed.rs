@@ -1,6 +1,4 @@
 //! Times of the networks, in milliseconds: `cargo run --release -p e2h-nn --example speed [threads [part of a name]]`.
-#![allow(clippy::print_stdout, reason = "an example prints")]
-
 use candle_core::{Device, Tensor};
 use e2h_nn::{
     Adam, AdamConfig, Builder, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, Result, RgbEncoder,
@@ -36,7 +34,12 @@ fn time(what: &str, runs: usize, mut f: impl FnMut() -> Result<()>) -> Result<()
     }
     let cpu = (cpu_ms() - cpu) / runs as f64;
     all.sort_by(f64::total_cmp);
-    println!("{what:<60} least {:8.2}  middle {:8.2}  processor {cpu:8.2}", all[0], all[all.len() / 2]);
+    e2h_core::say(format_args!(
+        "{what:<60} least {:8.2}  middle {:8.2}  processor {cpu:8.2}",
+        all[0],
+        all[all.len() / 2]
+    ))
+    .map_err(candle_core::Error::from)?;
     Ok(())
 }
 
@@ -88,7 +91,8 @@ fn all() -> Result<()> {
         let x = random(&[b, 16, 8], &mut rng)?;
         let cond = random(&[b, 160], &mut rng)?;
         let steps: Vec<f32> = (0..b).map(|i| (i % 100) as f32).collect();
-        println!("u-net {dims:?}: {} parameters", params.count());
+        e2h_core::say(format_args!("u-net {dims:?}: {} parameters", params.count()))
+            .map_err(candle_core::Error::from)?;
         time(&format!("u-net {dims:?}, batch {b}, both passes"), 15, || {
             backward(&mse(&net.forward(&x, &steps, &cond)?, &x, None)?, &params).map(drop)
         })?;
@@ -115,6 +119,6 @@ fn main() -> std::result::Result<(), Box<dyn std::error::Error>> {
     if let Some(n) = std::env::args().nth(1) {
         rayon::ThreadPoolBuilder::new().num_threads(n.parse()?).build_global()?;
     }
-    println!("{} threads", rayon::current_num_threads());
+    e2h_core::say(format_args!("{} threads", rayon::current_num_threads()))?;
     Ok(all()?)
 }

@@ -183,7 +183,7 @@ impl Stage {
 /// Progress goes beside the output.
 fn say(a: &Arguments, text: std::fmt::Arguments<'_>) {
     if !a.json {
-        eprintln!("{text}");
+        e2h_core::mention(text);
     }
 }
 

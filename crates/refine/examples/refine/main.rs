@@ -9,7 +9,6 @@
 //! Reads a LeRobotDataset v3.0, brings it to the rate of control, reverses it, cuts and re-times what stands still or is slow,
 //! with a critic leaves out what makes too little progress, and writes a LeRobotDataset with a report beside it. Needs no
 //! simulator and no network; minutes of recordings take seconds, the training of a critic minutes. `crates/refine/REAL_ROBOT.md` says what comes before and after.
-#![allow(clippy::print_stdout, reason = "what an example is for")]
 
 mod config;
 mod critic;
@@ -19,7 +18,7 @@ mod picture;
 use anyhow::{Context, Result, bail, ensure};
 use clap::Parser;
 use config::Config;
-use e2h_core::{Direction, Episode, Origin};
+use e2h_core::{Direction, Episode, Origin, mention, say};
 use e2h_data::lerobot::{
     ACTION_NAMES, Column, ColumnSlice, Dataset, Dtype, Feature, Features, Info, RobotColumns, Rotation,
     STATE_NAMES, Table, Writer, decode_png, source_columns, source_features,
@@ -144,7 +143,7 @@ fn program() -> Result<()> {
             Ok(plan) => plans.push(plan),
             Err(e) if a.skip_broken => {
                 let reason = e2h_core::one_line(&format!("{e:#}"));
-                eprintln!("left out episode {episode}: {reason}");
+                mention(format_args!("left out episode {episode}: {reason}"));
                 left_out.push(LeftOut { episode, reason });
             }
             Err(e) => return Err(e),
@@ -194,11 +193,11 @@ fn program() -> Result<()> {
     let html = page::html(&a, &config, judge.as_ref(), &accounts, &left_out, &info, &drawn)?;
     e2h_data::write_atomic(&a.out.join("report/report.html"), html.as_bytes())?;
     if a.json {
-        println!("{report}");
+        say(report)?;
     } else {
-        print!("{}", page::text(&accounts, &left_out, judge.as_ref()));
-        println!("dataset: {}", a.out.display());
-        println!("report: {}", a.out.join("report/report.html").display());
+        say(page::text(&accounts, &left_out, judge.as_ref()).trim_end())?;
+        say(format_args!("dataset: {}", a.out.display()))?;
+        say(format_args!("report: {}", a.out.join("report/report.html").display()))?;
     }
     Ok(())
 }

@@ -3,11 +3,9 @@ use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
 use auto_e2h::learn::{Collected, Run, RunOptions};
 use std::path::Path;
-use std::time::Duration;
 
 fn options(out: &Path) -> RunOptions {
     RunOptions {
-        task: "nut_assembly".to_owned(),
         preset: "smoke".to_owned(),
         seed: 5,
         // People who pause, and little training.
@@ -26,12 +24,8 @@ fn options(out: &Path) -> RunOptions {
         .map(str::to_owned)
         .to_vec(),
         out: Some(out.to_owned()),
-        resume: false,
-        device: "cpu".to_owned(),
-        threads: None,
         quiet: true,
-        tensorboard: false,
-        stop: auto_e2h::learn::Stop::default(),
+        ..RunOptions::new("nut_assembly")
     }
 }
 
@@ -65,7 +59,7 @@ fn accepted_rollouts_are_refined_stored_and_learned_from() {
     let hard = run.train_initial(&base).unwrap();
     let collected = scripted(&run);
     let frames: usize = collected.easy.iter().map(auto_e2h::core::Episode::len).sum();
-    let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
+    let accepted = run.lesson(1, &base, &*hard, || Ok(collected)).unwrap();
 
     let c = &accepted.collection;
     assert_eq!((c.accepted, c.hard_successes), (3, 3));
@@ -78,11 +72,11 @@ fn accepted_rollouts_are_refined_stored_and_learned_from() {
         segment.validate().unwrap();
         assert!(segment.origin.reversed && segment.origin.kind == Kind::Refined);
     }
-    let stored = run.stored(1).unwrap().unwrap();
+    let stored = run.lesson(1, &base, &*hard, || unreachable!("it is stored")).unwrap();
     assert_eq!(stored.segments, accepted.segments);
     assert_eq!(stored.collection, accepted.collection);
 
-    let updated = run.update(1, &hard, &base, &run.training_set(1, &accepted).unwrap()).unwrap();
+    let updated = run.update(1, &*hard, &base, &[accepted]).unwrap();
     assert_ne!(updated.weights().unwrap(), hard.weights().unwrap());
 }
 
@@ -94,16 +88,16 @@ fn without_a_hard_success_the_critic_is_skipped_and_without_rollouts_the_update(
     let hard = run.train_initial(&base).unwrap();
     let mut collected = scripted(&run);
     collected.hard.retain(|e| !e.outcome.is_success());
-    let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
+    let accepted = run.lesson(1, &base, &*hard, || Ok(collected)).unwrap();
     assert!(accepted.collection.notes.iter().any(|n| n.contains("no hard rollout succeeded")));
     assert!(!accepted.collection.fates.contains_key("low_advantage"));
     assert!(!accepted.segments.is_empty());
 
-    let none = run.refine(2, Collected::default(), Duration::ZERO, &base, &hard).unwrap();
-    assert!(none.segments.is_empty());
-    let same = run.update(2, &hard, &base, &none.segments).unwrap();
+    let none = [run.lesson(2, &base, &*hard, || Ok(Collected::default())).unwrap()];
+    assert!(none[0].segments.is_empty());
+    let same = run.update(2, &*hard, &base, &none).unwrap();
     assert_eq!(same.weights().unwrap(), hard.weights().unwrap());
-    let record = run.evaluate(2, &same, Some(&none)).unwrap();
+    let record = run.evaluate(2, &*same, none.last()).unwrap();
     assert!(record.skipped);
 }
 
@@ -117,7 +111,7 @@ fn all_rollouts_are_kept_as_a_dataset_when_asked_for() {
     let run = Run::open(&options).unwrap();
     let base = run.demonstrations().unwrap();
     let (easy, hard) = (run.train_easy(&base).unwrap(), run.train_initial(&base).unwrap());
-    let collected = run.collect(1, &hard, &easy).unwrap();
+    let collected = run.collect(1, &*hard, &*easy).unwrap();
     assert_eq!(collected.easy.len() + collected.rejected.len(), collected.easy_rollouts);
 
     let kept = Dataset::open(run.path().join("iteration_01/rollouts")).unwrap();
@@ -125,5 +119,5 @@ fn all_rollouts_are_kept_as_a_dataset_when_asked_for() {
     assert_eq!(kept.read_episode(0).unwrap(), collected.hard[0], "each cycle begins with its hard rollout");
     assert_eq!(kept.read_episode(1).unwrap().origin.direction, Direction::Easy);
     // The second collection of a resumed run leaves the dataset as it is.
-    run.collect(1, &hard, &easy).unwrap();
+    run.collect(1, &*hard, &*easy).unwrap();
 }

@@ -8,12 +8,12 @@
 
 mod common;
 
-use auto_e2h::learn::Result;
+use auto_e2h::learn::{Parts, Result};
 use common::{Learned, Run};
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    common::main("rod_insertion", learn)
+    common::main("rod_insertion", Parts::default(), learn)
 }
 
 fn learn(run: &Run) -> Result<Learned> {

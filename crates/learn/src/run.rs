@@ -13,7 +13,7 @@ use crate::method::{Lesson, Method, Round, Tools};
 use crate::methods;
 use crate::picture;
 use crate::policy_class::{Diffusion, Job, PolicyClass, Trained};
-use crate::record::{Collection, Reversal};
+use crate::record::{Collection, Reversal, RunResults};
 use crate::tensorboard::Events;
 use crate::{Error, Progress, Result, Stop};
 use e2h_core::{Direction, Episode, Kind, Origin, Policy, stream};
@@ -253,6 +253,25 @@ impl Run {
             seed: self.options.seed,
             reversed: false,
         }
+    }
+
+    /// All of algorithm 1, as `examples/nut_assembly.rs` spells it out; returns the results and the report's path.
+    ///
+    /// # Errors
+    /// Those of the stages.
+    pub fn learn(&self) -> Result<(RunResults, PathBuf)> {
+        let demonstrations = self.demonstrations()?;
+        let mut easy = self.train_easy(&demonstrations)?;
+        let mut hard = self.train_initial(&demonstrations)?;
+        let mut records = vec![self.evaluate(0, &*hard, None)?];
+        let mut rounds = vec![];
+        for n in 1..=self.iterations() {
+            rounds.push(self.lesson(n, &demonstrations, &*hard, || self.collect(n, &*hard, &*easy))?);
+            hard = self.update(n, &*hard, &demonstrations, &rounds)?;
+            easy = self.update_easy(n, easy, &demonstrations, &rounds)?;
+            records.push(self.evaluate(n, &*hard, rounds.last())?);
+        }
+        self.report(&demonstrations, records)
     }
 
     /// Records the easy demonstrations and reverses them into `D_h^(0)`.

@@ -28,7 +28,8 @@ fn laptop(c: &mut Criterion) {
 
     let mut group = c.benchmark_group("laptop");
     group.sample_size(20);
-    let data = TrainingData::new(&episodes, &[], 0.5, &config.policy, &normaliser).expect("windows");
+    let sources = [auto_e2h::data::Source::whole(episodes.clone())];
+    let data = TrainingData::new(&sources, &config.policy, &normaliser).expect("windows");
     let mut trainer =
         Trainer::new(&config.policy, &config.train.step, 1000, None, 0, "bench").expect("a trainer");
     group.bench_function("train_step", |b| b.iter(|| trainer.step(&data).expect("a step")));

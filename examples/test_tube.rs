@@ -8,36 +8,29 @@
 
 mod common;
 
-use auto_e2h::learn::Result;
+use auto_e2h::learn::{Parts, Result};
 use common::{Learned, Run};
 use std::process::ExitCode;
-use std::time::Instant;
 
 fn main() -> ExitCode {
-    common::main("test_tube", learn)
+    common::main("test_tube", Parts::default(), learn)
 }
 
 fn learn(run: &Run) -> Result<Learned> {
     // Line 1: easy demonstrations, their reversal, and a policy from each.
-    let base = run.demonstrations()?;
-    let mut easy = run.train_easy(&base)?;
-    let mut hard = run.train_initial(&base)?;
-    let mut records = vec![run.evaluate(0, &hard, None)?];
+    let demonstrations = run.demonstrations()?;
+    let mut easy = run.train_easy(&demonstrations)?;
+    let mut hard = run.train_initial(&demonstrations)?;
+    let mut records = vec![run.evaluate(0, &*hard, None)?];
 
     // Lines 2 to 8: each policy resets the scene for the other; what the easy one does, turned round, teaches the hard one.
+    let mut rounds = vec![];
     for n in 1..=run.iterations() {
-        let accepted = match run.stored(n)? {
-            Some(accepted) => accepted,
-            None => {
-                let clock = Instant::now();
-                let rollouts = run.collect(n, &hard, &easy)?;
-                run.refine(n, rollouts, clock.elapsed(), &base, &hard)?
-            }
-        };
-        hard = run.update(n, &hard, &base, &run.training_set(n, &accepted)?)?;
-        easy = run.update_easy(n, easy, &base)?; // the paper's stays as it is
-        records.push(run.evaluate(n, &hard, Some(&accepted))?);
+        rounds.push(run.lesson(n, &demonstrations, &*hard, || run.collect(n, &*hard, &*easy))?);
+        hard = run.update(n, &*hard, &demonstrations, &rounds)?;
+        easy = run.update_easy(n, easy, &demonstrations, &rounds)?; // the paper's stays as it is
+        records.push(run.evaluate(n, &*hard, rounds.last())?);
     }
 
-    run.report(&base, records)
+    run.report(&demonstrations, records)
 }

@@ -77,3 +77,57 @@ fn experts_print_one_line_a_pair() {
     }
     assert!(printed.lines().count() >= 1);
 }
+
+/// Every stage of a run, for real: something was accepted, a critic trained, an update made.
+fn whole(out: &std::path::Path) -> serde_json::Value {
+    let results = std::fs::read_to_string(out.join("results.json")).unwrap();
+    let results: serde_json::Value = serde_json::from_str(&results).unwrap();
+    let last = &results["iterations"][1];
+    assert!(last["collection"]["accepted"].as_u64().unwrap() > 0, "{last}");
+    assert!(last["collection"]["critic_loss"].is_f64() && last["skipped"] == false, "{last}");
+    results
+}
+
+#[test]
+fn a_task_pair_from_outside_the_library_is_learned() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("run");
+    let output =
+        example("own_task").args(["--preset", "smoke", "--quiet", "--out"]).arg(&out).output().unwrap();
+    assert_success(&output);
+    assert_eq!(whole(&out)["task"], "block_on_pedestal");
+    // What the registry does not have is told by name.
+    let output =
+        example("evaluate").arg("--checkpoint").arg(out.join("iteration_01/policy")).output().unwrap();
+    assert!(!output.status.success());
+    let told = text(&output.stderr);
+    assert!(told.contains("unknown task `block_on_pedestal`"), "{told}");
+}
+
+#[test]
+fn a_class_of_policies_from_outside_the_library_learns_in_the_loop_and_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |out: &str, more: &[&str]| {
+        let mut command = example("own_policy");
+        command.args(["--preset", "smoke", "--quiet", "--set", "train.save_every=20", "--out"]);
+        command.arg(dir.path().join(out)).args(more).output().unwrap()
+    };
+    assert_success(&run("one", &[]));
+    whole(&dir.path().join("one"));
+    let folder = dir.path().join("one/iteration_01/policy");
+    let about = std::fs::read_to_string(folder.join("policy.json")).unwrap();
+    assert!(about.contains("\"kind\": \"mlp\""), "{about}");
+    let output = example("evaluate").arg("--checkpoint").arg(&folder).output().unwrap();
+    let told = text(&output.stderr);
+    assert!(!output.status.success() && told.contains("expected a policy of kind `diffusion`"), "{told}");
+
+    // A weight that was flipped is found when the run goes on, whatever the class.
+    let weights = folder.join("model.safetensors");
+    let mut bytes = std::fs::read(&weights).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    std::fs::write(&weights, bytes).unwrap();
+    let output = run("one", &["--resume"]);
+    let told = text(&output.stderr);
+    assert!(!output.status.success() && told.contains("model.safetensors: SHA-256"), "{told}");
+}

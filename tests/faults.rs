@@ -74,8 +74,8 @@ const PROGRAMS: [(&str, &str); 15] = [
     ("speed", "1 nothing"),
     ("view", "RUN --out NEW/page.html --tensorboard NEW/events"),
 ];
-/// The other pairs are run by what runs `nut_assembly`; `publish` needs a hub; `lerobot_actions` prints nothing.
-const OTHERS: [&str; 11] = [
+/// The other benchmarks are run by what runs `nut_assembly`; `publish` needs a hub; `lerobot_actions` prints nothing.
+const OTHERS: [&str; 13] = [
     "brush",
     "cube_pick_place",
     "cube_stack",
@@ -83,6 +83,8 @@ const OTHERS: [&str; 11] = [
     "disk",
     "lerobot_actions",
     "mouse",
+    "own_policy",
+    "own_task",
     "peg_insertion",
     "publish",
     "rod_insertion",

@@ -1,13 +1,12 @@
 use auto_e2h::core::{Direction, Kind, Origin, stream};
 use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
-use auto_e2h::learn::{Collected, Run, RunOptions};
+use auto_e2h::learn::{Accepted, Collected, Json, Run, RunOptions};
+use std::collections::BTreeMap;
 use std::path::Path;
-use std::time::Duration;
 
 fn options(out: &Path) -> RunOptions {
     RunOptions {
-        task: "nut_assembly".to_owned(),
         preset: "smoke".to_owned(),
         seed: 5,
         // People who pause, and little training.
@@ -26,12 +25,8 @@ fn options(out: &Path) -> RunOptions {
         .map(str::to_owned)
         .to_vec(),
         out: Some(out.to_owned()),
-        resume: false,
-        device: "cpu".to_owned(),
-        threads: None,
         quiet: true,
-        tensorboard: false,
-        stop: auto_e2h::learn::Stop::default(),
+        ..RunOptions::new("nut_assembly")
     }
 }
 
@@ -65,7 +60,7 @@ fn accepted_rollouts_are_refined_stored_and_learned_from() {
     let hard = run.train_initial(&base).unwrap();
     let collected = scripted(&run);
     let frames: usize = collected.easy.iter().map(auto_e2h::core::Episode::len).sum();
-    let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
+    let accepted = run.lesson(1, &base, &*hard, || Ok(collected)).unwrap();
 
     let c = &accepted.collection;
     assert_eq!((c.accepted, c.hard_successes), (3, 3));
@@ -78,11 +73,11 @@ fn accepted_rollouts_are_refined_stored_and_learned_from() {
         segment.validate().unwrap();
         assert!(segment.origin.reversed && segment.origin.kind == Kind::Refined);
     }
-    let stored = run.stored(1).unwrap().unwrap();
+    let stored = run.lesson(1, &base, &*hard, || unreachable!("it is stored")).unwrap();
     assert_eq!(stored.segments, accepted.segments);
     assert_eq!(stored.collection, accepted.collection);
 
-    let updated = run.update(1, &hard, &base, &run.training_set(1, &accepted).unwrap()).unwrap();
+    let updated = run.update(1, &*hard, &base, &[accepted]).unwrap();
     assert_ne!(updated.weights().unwrap(), hard.weights().unwrap());
 }
 
@@ -94,17 +89,85 @@ fn without_a_hard_success_the_critic_is_skipped_and_without_rollouts_the_update(
     let hard = run.train_initial(&base).unwrap();
     let mut collected = scripted(&run);
     collected.hard.retain(|e| !e.outcome.is_success());
-    let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
+    let accepted = run.lesson(1, &base, &*hard, || Ok(collected)).unwrap();
     assert!(accepted.collection.notes.iter().any(|n| n.contains("no hard rollout succeeded")));
     assert!(!accepted.collection.fates.contains_key("low_advantage"));
     assert!(!accepted.segments.is_empty());
 
-    let none = run.refine(2, Collected::default(), Duration::ZERO, &base, &hard).unwrap();
-    assert!(none.segments.is_empty());
-    let same = run.update(2, &hard, &base, &none.segments).unwrap();
+    let none = [run.lesson(2, &base, &*hard, || Ok(Collected::default())).unwrap()];
+    assert!(none[0].segments.is_empty());
+    let same = run.update(2, &*hard, &base, &none).unwrap();
     assert_eq!(same.weights().unwrap(), hard.weights().unwrap());
-    let record = run.evaluate(2, &same, Some(&none)).unwrap();
+    let record = run.evaluate(2, &*same, none.last()).unwrap();
     assert!(record.skipped);
+}
+
+#[test]
+fn every_method_makes_its_own_lesson_of_the_same_rollouts() {
+    let dir = tempfile::tempdir().unwrap();
+    let lesson = |method: &str| {
+        let mut options = options(&dir.path().join(method));
+        method.clone_into(&mut options.method);
+        options.set.push("train.initial_steps=2".to_owned());
+        let run = Run::open(&options).unwrap();
+        let demonstrations = run.demonstrations().unwrap();
+        let hard = run.train_initial(&demonstrations).unwrap();
+        run.lesson(1, &demonstrations, &*hard, || Ok(scripted(&run))).unwrap()
+    };
+    let [whole, literal, no_kinematic, no_critic, direct] =
+        ["auto-e2h", "auto-e2h-literal", "no-kinematic", "no-critic", "direct-h"].map(lesson);
+    let fates = |accepted: &Accepted| accepted.collection.fates.clone();
+
+    assert!(fates(&whole).contains_key("low_advantage") && fates(&whole).contains_key("static"));
+    // No gates: what they say is not in the notes, and pauses shorter than 16 frames stay.
+    assert!(literal.collection.notes.iter().all(|n| n.contains("0 of") || !n.starts_with("suffix")));
+    assert!(fates(&literal).get("static") < fates(&whole).get("static"));
+    assert!(!fates(&no_kinematic).contains_key("static") && !fates(&no_kinematic).contains_key("retimed"));
+    assert!(fates(&no_kinematic).contains_key("low_advantage"));
+    assert!(!fates(&no_critic).contains_key("low_advantage") && no_critic.collection.critic_loss.is_none());
+    // Hard successes, forwards, each with its own labels.
+    assert_eq!((direct.collection.accepted, direct.collection.hard_successes), (3, 3));
+    for segment in &direct.segments {
+        assert!(segment.origin.direction == Direction::Hard && !segment.origin.reversed);
+    }
+}
+
+#[test]
+fn hard_demonstrations_alone_are_of_the_hard_task() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options(&dir.path().join("run"));
+    options.method = "hard-demos".to_owned();
+    options.set.push("train.initial_steps=2".to_owned());
+    let run = Run::open(&options).unwrap();
+    assert_eq!(run.iterations(), 0);
+    run.train_initial(&run.demonstrations().unwrap()).unwrap();
+    let recorded = Dataset::open(run.path().join("demonstrations_hard")).unwrap();
+    let first = recorded.read_episode(0).unwrap();
+    assert!(first.origin.direction == Direction::Hard && first.outcome.is_success());
+    assert_eq!(recorded.len(), 2);
+}
+
+#[test]
+fn a_stage_of_ones_own_is_made_once_and_verified() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options(&dir.path().join("run"));
+    let make = |run: &Run, made: &std::cell::Cell<u32>| {
+        run.stage("mine/counts.json", || {
+            made.set(made.get() + 1);
+            Ok(Json(BTreeMap::from([("nuts".to_owned(), 3)])))
+        })
+    };
+    let made = std::cell::Cell::new(0);
+    let first = make(&Run::open(&options).unwrap(), &made).unwrap();
+    options.resume = true;
+    let run = Run::open(&options).unwrap();
+    assert_eq!(make(&run, &made).unwrap(), first);
+    assert_eq!(made.get(), 1);
+    let file = run.path().join("mine/counts.json");
+    let text = std::fs::read_to_string(&file).unwrap().replace("\"nuts\": 3", "\"nuts\": 4");
+    std::fs::write(&file, text).unwrap();
+    let message = make(&run, &made).unwrap_err().to_string();
+    assert!(message.contains("counts.json") && message.contains("SHA-256"), "{message}");
 }
 
 #[test]
@@ -117,7 +180,7 @@ fn all_rollouts_are_kept_as_a_dataset_when_asked_for() {
     let run = Run::open(&options).unwrap();
     let base = run.demonstrations().unwrap();
     let (easy, hard) = (run.train_easy(&base).unwrap(), run.train_initial(&base).unwrap());
-    let collected = run.collect(1, &hard, &easy).unwrap();
+    let collected = run.collect(1, &*hard, &*easy).unwrap();
     assert_eq!(collected.easy.len() + collected.rejected.len(), collected.easy_rollouts);
 
     let kept = Dataset::open(run.path().join("iteration_01/rollouts")).unwrap();
@@ -125,5 +188,5 @@ fn all_rollouts_are_kept_as_a_dataset_when_asked_for() {
     assert_eq!(kept.read_episode(0).unwrap(), collected.hard[0], "each cycle begins with its hard rollout");
     assert_eq!(kept.read_episode(1).unwrap().origin.direction, Direction::Easy);
     // The second collection of a resumed run leaves the dataset as it is.
-    run.collect(1, &hard, &easy).unwrap();
+    run.collect(1, &*hard, &*easy).unwrap();
 }

@@ -3,7 +3,7 @@
 use auto_e2h::core::{Failure, mention, say};
 pub(crate) use auto_e2h::learn::Run;
 use auto_e2h::learn::record::RunResults;
-use auto_e2h::learn::{Error, Result, RunOptions, Stop, report};
+use auto_e2h::learn::{Error, Parts, Result, RunOptions, Stop, report};
 use clap::{Parser, ValueEnum};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -13,8 +13,8 @@ pub(crate) type Learned = (RunResults, PathBuf);
 
 /// Learns a pair with what the command line asks for, and tells how it went. SIGINT and SIGTERM end it with its state saved, and
 /// with status 130 and 143.
-pub(crate) fn main(task: &str, learn: fn(&Run) -> Result<Learned>) -> ExitCode {
-    let done = options(task).and_then(|o| Run::open(&o)).and_then(|run| learn(&run));
+pub(crate) fn main(task: &str, parts: Parts, learn: fn(&Run) -> Result<Learned>) -> ExitCode {
+    let done = options(task).and_then(|o| Run::open_with(&o, &parts)).and_then(|run| learn(&run));
     let told = match done {
         Ok((results, page)) => say(report::table::iterations(&results))
             .and_then(|()| say(format_args!("report: {}", page.display())))
@@ -47,6 +47,9 @@ struct Arguments {
     /// Sizes and step counts to run with.
     #[arg(long, value_enum, default_value = "laptop")]
     preset: Preset,
+    /// What the loop teaches: auto-e2h, auto-e2h-literal, no-kinematic, no-critic, direct-h or hard-demos.
+    #[arg(long, default_value = "auto-e2h")]
+    method: String,
     /// Seed of everything random.
     #[arg(long, default_value_t = 0)]
     seed: u64,
@@ -89,6 +92,7 @@ fn options(task: &str) -> Result<RunOptions> {
     Ok(RunOptions {
         task: task.to_owned(),
         preset: preset.to_owned(),
+        method: a.method,
         seed: a.seed,
         set,
         out: a.out,

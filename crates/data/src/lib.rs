@@ -45,6 +45,6 @@ pub use error::{Error, Result};
 pub use file::read_regular;
 pub use normalise::{Normaliser, NormaliserConfig};
 pub use resize::resize_image;
-pub use sample::{Pick, Sampler, Set};
+pub use sample::{Pick, Sampler, Source};
 pub use store::{EpisodeStore, Summary};
 pub use window::{Alignment, Window, WindowConfig, Windows};

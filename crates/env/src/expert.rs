@@ -212,7 +212,7 @@ fn steps(seconds: f64) -> usize {
 }
 
 /// Uniform in a range; its lower end when the range is empty.
-pub(crate) fn draw(rng: &mut Rng, [low, high]: [f64; 2]) -> f64 {
+pub fn draw(rng: &mut Rng, [low, high]: [f64; 2]) -> f64 {
     low + (high - low).max(0.0) * rng.random::<f64>()
 }
 
@@ -222,6 +222,6 @@ pub(crate) fn gauss(rng: &mut Rng, deviation: f64) -> f64 {
 }
 
 /// A normal step in the plane, m.
-pub(crate) fn scatter(rng: &mut Rng, deviation: f64) -> Vector3<f64> {
+pub fn scatter(rng: &mut Rng, deviation: f64) -> Vector3<f64> {
     Vector3::new(gauss(rng, deviation), gauss(rng, deviation), 0.0)
 }

@@ -45,6 +45,13 @@ pub use sim::{MAX_OPENING, Sim};
 pub use task::{Task, registry, task, variants};
 pub use tasks::*;
 
+/// What pick-and-place pairs are made of: regions and pieces of predicates, grasps, and the one script of their demonstrators.
+pub mod toolkit {
+    pub use crate::expert::{draw, scatter};
+    pub use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
+    pub use crate::tabletop::{Region, beside, left_alone, near_middle, tilt, turn};
+}
+
 /// What can go wrong in an environment.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]

@@ -12,7 +12,8 @@ pub(crate) const GENTLE: f64 = 0.8;
 const RELEASE_GAP: f64 = 0.001;
 
 /// Gripper pointing down, its fingers closing along y turned by `yaw`.
-pub(crate) fn down(yaw: f64) -> UnitQuaternion<f64> {
+#[must_use]
+pub fn down(yaw: f64) -> UnitQuaternion<f64> {
     turn(yaw) * UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI)
 }
 
@@ -45,7 +46,7 @@ pub(crate) fn upright(orientation: UnitQuaternion<f64>) -> UnitQuaternion<f64> {
 
 /// In which of the directions that an object's shape allows the fingers close.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Symmetry {
+pub enum Symmetry {
     /// Across the object's y axis.
     Two,
     /// Across y or x, whichever is nearer to straight ahead.
@@ -53,7 +54,8 @@ pub(crate) enum Symmetry {
 }
 
 /// The hand that grasps a standing object from above: `along` metres up its z axis from its origin, in line with that axis.
-pub(crate) fn from_above(object: &Pose, along: f64, symmetry: Symmetry) -> Pose {
+#[must_use]
+pub fn from_above(object: &Pose, along: f64, symmetry: Symmetry) -> Pose {
     let axis = object.orientation * Vector3::z();
     let yaw = match symmetry {
         Symmetry::Two => fold(yaw_of(&object.orientation)),
@@ -69,7 +71,7 @@ pub(crate) fn from_above(object: &Pose, along: f64, symmetry: Symmetry) -> Pose 
 
 /// How the object is turned where it is put down.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Turn {
+pub enum Turn {
     /// Upright, its yaw as it is.
     Keep,
     /// Upright, at the yaw that it has when the hand's is this, rad.
@@ -93,7 +95,8 @@ impl Turn {
 }
 
 /// The two ends of the way in the order in which a direction needs them.
-pub(crate) fn ordered(direction: Direction, start: Stand, goal: Stand) -> [Stand; 2] {
+#[must_use]
+pub fn ordered(direction: Direction, start: Stand, goal: Stand) -> [Stand; 2] {
     match direction {
         Direction::Hard => [start, goal],
         Direction::Easy => [goal, start],
@@ -102,22 +105,23 @@ pub(crate) fn ordered(direction: Direction, start: Stand, goal: Stand) -> [Stand
 
 /// One end of the way: where the object stands, and how it and the hand come and go there.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Stand {
+pub struct Stand {
     /// Position of the object's frame when it stands there, m. What the script takes up may stand anywhere near.
-    pub(crate) at: Vector3<f64>,
+    pub at: Vector3<f64>,
     /// How it is turned there.
-    pub(crate) turn: Turn,
+    pub turn: Turn,
     /// How far the hand draws back from its grasp, m.
-    pub(crate) retreat: f64,
+    pub retreat: f64,
     /// How far above the stand the object's frame comes and goes, m.
-    pub(crate) lift: f64,
+    pub lift: f64,
     /// True where only the way straight up leads out (a hole, a peg): the object then passes right over [`Self::at`].
-    pub(crate) tight: bool,
+    pub tight: bool,
 }
 
 impl Stand {
     /// A place on the table, or in something flat.
-    pub(crate) fn open(at: Vector3<f64>, turn: Turn) -> Self {
+    #[must_use]
+    pub fn open(at: Vector3<f64>, turn: Turn) -> Self {
         Self { at, turn, retreat: 0.06, lift: 0.07, tight: false }
     }
 
@@ -136,7 +140,7 @@ pub(crate) fn carry(sim: &Sim, position: Vector3<f64>, orientation: UnitQuaterni
 /// The demonstration of every pick-and-place pair: come over the object, grasp it, carry it over the other stand, put it
 /// down gently, let go, draw back, go home. `stands` gives where from and where to in the scene as it is, `grasp` the hand's
 /// pose for an object's.
-pub(crate) fn pick_place(
+pub fn pick_place(
     stands: impl Fn(&Sim) -> [Stand; 2] + Send + 'static,
     grasp: impl Fn(&Pose) -> Pose + Send + 'static,
     config: &DemonstratorConfig,

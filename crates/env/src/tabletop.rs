@@ -15,26 +15,30 @@ pub(crate) const MARGIN: f64 = 0.02;
 
 /// A rectangle on the table, m in the frame of the robot's base.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Region {
-    pub(crate) x: [f64; 2],
-    pub(crate) y: [f64; 2],
+pub struct Region {
+    /// Range of x.
+    pub x: [f64; 2],
+    /// Range of y.
+    pub y: [f64; 2],
 }
 
 impl Region {
     /// A point of the region at a height.
-    pub(crate) fn draw(&self, rng: &mut Rng, height: f64) -> Vector3<f64> {
+    pub fn draw(&self, rng: &mut Rng, height: f64) -> Vector3<f64> {
         Vector3::new(draw(rng, self.x), draw(rng, self.y), height)
     }
 
     /// The point nearest to `p`, on the level, that is over the region or within three quarters of [`MARGIN`]: what is put
     /// down there still counts when the hand pushes it a little as it lets go.
-    pub(crate) fn nearest(&self, p: &Vector3<f64>) -> Vector3<f64> {
+    #[must_use]
+    pub fn nearest(&self, p: &Vector3<f64>) -> Vector3<f64> {
         let nearest = |v: f64, [low, high]: [f64; 2]| v.clamp(low - 0.75 * MARGIN, high + 0.75 * MARGIN);
         Vector3::new(nearest(p.x, self.x), nearest(p.y, self.y), p.z)
     }
 
     /// Whether a point is over the region or within [`MARGIN`] of it.
-    pub(crate) fn contains(&self, p: &Vector3<f64>) -> bool {
+    #[must_use]
+    pub fn contains(&self, p: &Vector3<f64>) -> bool {
         let within = |v: f64, [low, high]: [f64; 2]| (low - MARGIN..=high + MARGIN).contains(&v);
         within(p.x, self.x) && within(p.y, self.y)
     }
@@ -62,7 +66,7 @@ pub(crate) fn near_straight(rng: &mut Rng, most: f64) -> f64 {
 }
 
 /// A point of a disk at whose middle was aimed: all of the disk is covered, its edge seldom.
-pub(crate) fn near_middle(rng: &mut Rng, radius: f64) -> Vector3<f64> {
+pub fn near_middle(rng: &mut Rng, radius: f64) -> Vector3<f64> {
     loop {
         let p = Vector3::new(aimed(rng), aimed(rng), 0.0);
         if p.norm() <= 1.0 {
@@ -72,7 +76,8 @@ pub(crate) fn near_middle(rng: &mut Rng, radius: f64) -> Vector3<f64> {
 }
 
 /// A rotation about the vertical.
-pub(crate) fn turn(yaw: f64) -> UnitQuaternion<f64> {
+#[must_use]
+pub fn turn(yaw: f64) -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw)
 }
 
@@ -83,16 +88,19 @@ pub(crate) fn lean(rng: &mut Rng, most: f64) -> UnitQuaternion<f64> {
 }
 
 /// Angle between a body's z axis and the vertical, rad.
-pub(crate) fn tilt(pose: &Pose) -> f64 {
+#[must_use]
+pub fn tilt(pose: &Pose) -> f64 {
     (pose.orientation * Vector3::z()).z.clamp(-1.0, 1.0).acos()
 }
 
 /// Distance of two points seen from above, m.
-pub(crate) fn beside(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
+#[must_use]
+pub fn beside(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
     (a.xy() - b.xy()).norm()
 }
 
 /// Whether the gripper let go of the object and the hand is well above it.
-pub(crate) fn left_alone(sim: &Sim) -> bool {
+#[must_use]
+pub fn left_alone(sim: &Sim) -> bool {
     sim.released() && sim.tcp().position.z - sim.object().position.z > AWAY
 }

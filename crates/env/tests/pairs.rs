@@ -381,3 +381,18 @@ fn every_start_of_the_hard_task_is_where_the_object_may_be_put_down() {
         }
     });
 }
+
+/// Demonstrations end anywhere in the region, so a policy that learned from them goes on moving there: it has to count.
+#[test]
+fn a_rod_is_out_while_it_still_moves() {
+    let task = task("rod_insertion", &TaskOptions::default()).unwrap();
+    let (mut env, config) = (blind(&task), DemonstratorConfig::clean());
+    let moving = (0..5).filter(|&i| {
+        let origin = Origin::demonstration("rod_insertion", Direction::Easy, i, 0);
+        let mut rng = stream(0, "moving", 0, u64::from(i));
+        let episode = demonstrate(&mut env, Direction::Easy, &config, origin, &mut rng).unwrap();
+        let Outcome::Success { at } = episode.outcome else { panic!("{:?}", episode.outcome) };
+        (episode.eef(at + 1).position - episode.eef(at).position).norm() > 0.003
+    });
+    assert!(moving.count() >= 3);
+}

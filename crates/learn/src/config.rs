@@ -4,7 +4,7 @@ mod validate;
 
 use crate::{Error, ExploreConfig, Result};
 use e2h_core::nearest;
-use e2h_env::{DemonstratorConfig, EnvConfig, TaskOptions};
+use e2h_env::{DemonstratorConfig, EnvConfig, Task, TaskOptions};
 use e2h_nn::Precision;
 use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
 use e2h_refine::{AdvantageConfig, GateConfig, GoalConfig, KinematicConfig, ReverseConfig, SuffixConfig};
@@ -228,8 +228,20 @@ impl RunConfig {
     /// Unknown preset, task or key (the nearest known one is named), a value of the wrong type, or values that do not fit
     /// together (all of them are listed).
     pub fn resolve(preset: &str, task: &str, overrides: &[String]) -> Result<Resolved> {
+        Self::resolve_with(preset, task, None, &Table::new(), overrides)
+    }
+
+    /// The same with the text of a task file of one's own in place of the registry's, and with the values of a method, which
+    /// win over the task file's.
+    pub(crate) fn resolve_with(
+        preset: &str,
+        task: &str,
+        own: Option<&str>,
+        method: &Table,
+        overrides: &[String],
+    ) -> Result<Resolved> {
         let mut table = parse(preset, find("preset", preset, &PRESETS)?)?;
-        let of_task = parse(task, find("task", task, &TASKS)?)?;
+        let of_task = parse(task, own.map_or_else(|| find("task", task, &TASKS), Ok)?)?;
         // A task file has entries for all presets, and may have some for one alone.
         let mut common = of_task.clone();
         let special = common.remove("preset");
@@ -239,6 +251,7 @@ impl RunConfig {
         {
             merge(&mut table, special, "")?;
         }
+        merge(&mut table, method, "")?;
         for text in overrides {
             let (key, value) = text
                 .split_once('=')
@@ -263,7 +276,22 @@ impl RunConfig {
             let text = format!("task.name: expected `{task}`, got `{found}`; each pair has its own program");
             return Err(Error::Config(text));
         }
-        Self::from_table(preset, table)
+        let resolved = Self::from_table(preset, table);
+        match own {
+            Some(_) => resolved,
+            None => resolved.and_then(|r| r.config.check_registry().map(|()| r)),
+        }
+    }
+
+    /// Fills in what the task knows and nobody chooses.
+    pub(crate) fn know(&mut self, task: &dyn Task) {
+        let r = &mut self.refine;
+        r.reverse.reference_quaternion = task.eef_reference();
+        r.reverse.object_reference = Some(task.object_reference());
+        // What is held throughout is neither grasped nor let go.
+        let switches = usize::from(task.homes());
+        (r.gate.closings, r.gate.openings) = (switches, switches);
+        r.advantage.horizon = self.env.horizon_hard;
     }
 
     /// Reads a resolved configuration that a run wrote.
@@ -292,7 +320,7 @@ fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str
 }
 
 /// What may have been meant, or all that can be.
-fn suggestion(name: &str, prefix: &str, known: &[&str]) -> String {
+pub(crate) fn suggestion(name: &str, prefix: &str, known: &[&str]) -> String {
     match nearest(name, known.iter().copied()) {
         Some(near) => format!("did you mean `{prefix}{near}`?"),
         None => format!("known: {}", known.join(", ")),
@@ -371,11 +399,6 @@ mod tests {
         for (name, _) in TASKS {
             let config = RunConfig::resolve("paper", name, &[]).unwrap().config;
             let task = e2h_env::task(name, &config.task.options()).unwrap();
-            assert_eq!(config.refine.reverse.reference_quaternion, task.eef_reference(), "{name}");
-            // What is held throughout is neither grasped nor let go.
-            let switches = usize::from(task.homes());
-            let gate = &config.refine.gate;
-            assert_eq!((gate.closings, gate.openings), (switches, switches), "{name}");
             assert_eq!(config.refine.suffix.enabled, !task.homes(), "{name}");
         }
     }

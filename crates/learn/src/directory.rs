@@ -1,9 +1,11 @@
 //! The run directory: what is in it, and how it is written so that a kill at any instant leaves it usable.
 
 use crate::config::{Resolved, RunConfig};
+use crate::run::RunOptions;
 use crate::{Error, Result};
 use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
+use e2h_env::Task;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
@@ -40,6 +42,13 @@ pub(crate) struct Identity {
     pub(crate) task: String,
     pub(crate) preset: String,
     pub(crate) seed: u64,
+    /// None in runs of version 0.1, which were all of the default one.
+    #[serde(default = "default_method")]
+    pub(crate) method: String,
+}
+
+fn default_method() -> String {
+    crate::methods::DEFAULT.to_owned()
 }
 
 /// A run directory that is this run's own.
@@ -85,7 +94,10 @@ fn sweep(folder: &Path, depth: usize) -> Result<()> {
         let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
         let Ok(kind) = entry.file_type() else { continue };
         let done = || folder.join("notes.json").exists();
-        if kind.is_file() && (TEMPORARY.iter().any(|p| name.starts_with(p)) || (name == TRAINING && done())) {
+        if kind.is_file()
+            && (TEMPORARY.iter().any(|p| name.starts_with(p))
+                || ([TRAINING, "training.json"].contains(&&*name) && done()))
+        {
             std::fs::remove_file(&path).map_err(io("removing", &path))?;
         } else if kind.is_dir() && name.ends_with(UNFINISHED) {
             std::fs::remove_dir_all(&path).map_err(io("removing", &path))?;
@@ -127,8 +139,9 @@ enum Difference {
     More,
 }
 
-fn difference(written: &str, given: &Resolved) -> Result<Difference> {
+fn difference(written: &str, given: &Resolved, task: &dyn Task) -> Result<Difference> {
     let (mut a, b) = (RunConfig::from_text(&given.preset, written)?.config, &given.config);
+    a.know(task);
     if a == *b {
         return Ok(Difference::None);
     }
@@ -140,13 +153,18 @@ impl Directory {
     /// Makes a new run directory, or goes on with one of the same run.
     pub(crate) fn open(
         path: &Path,
-        resume: bool,
-        task: &str,
-        seed: u64,
+        options: &RunOptions,
         resolved: &Resolved,
+        task: &dyn Task,
     ) -> Result<Self> {
-        let identity =
-            Identity { format: FORMAT, task: task.to_owned(), preset: resolved.preset.clone(), seed };
+        let resume = options.resume;
+        let identity = Identity {
+            format: FORMAT,
+            task: options.task.clone(),
+            preset: resolved.preset.clone(),
+            seed: options.seed,
+            method: options.method.clone(),
+        };
         let file = path.join("run.json");
         if resume && !path.exists() {
             return Err(Error::Nothing(path.to_owned()));
@@ -182,14 +200,14 @@ impl Directory {
             return differs("layout version", FORMAT.to_string(), found.format.to_string());
         }
         if found != identity {
-            let text = |i: &Identity| format!("{} {} seed {}", i.task, i.preset, i.seed);
+            let text = |i: &Identity| format!("{} {} {} seed {}", i.task, i.preset, i.method, i.seed);
             return differs("run.json", text(&identity), text(&found));
         }
         let config = path.join("config.toml");
         let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;
         // What later versions added has a default, which is what was done before. Where a key has none, or is gone, no value of
         // ours is what the run was begun with.
-        let difference = difference(&text, resolved).map_err(|e| Error::Foreign {
+        let difference = difference(&text, resolved, task).map_err(|e| Error::Foreign {
             path: config.clone(),
             quantity: "configuration".to_owned(),
             expected: "one of this version (a run ends with the version that began it)".to_owned(),
@@ -266,7 +284,7 @@ impl Directory {
     }
 
     /// SHA-256 of every file below a folder, by its path there.
-    fn sums(&self, name: &str, below: &str, sums: &mut BTreeMap<String, String>) -> Result<()> {
+    pub(crate) fn sums(&self, name: &str, below: &str, sums: &mut BTreeMap<String, String>) -> Result<()> {
         let folder = self.join(name).join(below);
         for entry in std::fs::read_dir(&folder).map_err(io("reading", &folder))?.flatten() {
             let file = entry.file_name().to_string_lossy().into_owned();

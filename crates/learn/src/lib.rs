@@ -5,23 +5,12 @@
 //! ```no_run
 //! use e2h_learn::{Run, RunOptions};
 //!
-//! let options = RunOptions {
-//!     task: "nut_assembly".to_owned(),
-//!     preset: "smoke".to_owned(),
-//!     seed: 0,
-//!     set: vec!["loop.cycles=2".to_owned()],
-//!     out: None,
-//!     resume: false,
-//!     device: "cpu".to_owned(),
-//!     threads: None,
-//!     quiet: false,
-//!     tensorboard: false,
-//!     stop: Default::default(),
-//! };
+//! let set = vec!["loop.cycles=2".to_owned()];
+//! let options = RunOptions { preset: "smoke".to_owned(), set, ..RunOptions::new("nut_assembly") };
 //! let run = Run::open(&options)?;
-//! let base = run.demonstrations()?;
-//! let hard = run.train_initial(&base)?;
-//! let record = run.evaluate(0, &hard, None)?;
+//! let demonstrations = run.demonstrations()?;
+//! let hard = run.train_initial(&demonstrations)?;
+//! let record = run.evaluate(0, &*hard, None)?;
 //! println!("{} of {}", record.evaluation.successes, record.evaluation.trials);
 //! # Ok::<(), e2h_learn::Error>(())
 //! ```
@@ -33,7 +22,10 @@ mod error;
 mod evaluate;
 mod explore;
 pub mod hub;
+mod method;
+pub mod methods;
 mod picture;
+mod policy_class;
 mod progress;
 mod published;
 pub mod record;
@@ -49,7 +41,9 @@ pub use config::{Resolved, RunConfig};
 pub use error::{Error, Result};
 pub use evaluate::{Evaluated, Filmed, Filming, Trial, evaluate};
 pub use explore::ExploreConfig;
+pub use method::{Lesson, Method, Round, Tools};
+pub use policy_class::{Diffusion, Job, PolicyClass, Trained, Training};
 pub use progress::{Bar, Progress};
 pub use published::Published;
-pub use run::{Accepted, Base, Run, RunOptions, set_threads};
+pub use run::{Accepted, BuildTask, Demonstrations, Json, Parts, Run, RunOptions, Stored, set_threads};
 pub use stop::Stop;

@@ -161,6 +161,9 @@ pub struct RunResults {
     pub variant: String,
     /// Preset name.
     pub preset: String,
+    /// Method name; empty in results of version 0.1, which were all of `auto-e2h`.
+    #[serde(default)]
+    pub method: String,
     /// Run seed.
     pub seed: u64,
     /// Version of this library that made the run.

@@ -1,29 +1,35 @@
 //! A run: its directory, its stages, and how it goes on after a kill.
 //!
 //! Every stage is a function of the configuration, the seed and what earlier stages left, and its result is written whole or
-//! not at all. Resuming is calling the same stages again: a stage whose result is there reads it.
+//! not at all ([`Run::stage`]). Resuming is calling the same stages again: a stage whose result is there reads it.
 
 mod measure;
+mod stage;
 
 use crate::collect::{Collected, collect};
 use crate::config::{Resolved, RunConfig, UpdateFrom};
 use crate::directory::{Directory, TRAINING, write_atomic};
+use crate::method::{Lesson, Method, Round, Tools};
+use crate::methods;
 use crate::picture;
-use crate::record::{Collection, Reversal};
+use crate::policy_class::{Diffusion, Job, PolicyClass, Trained};
+use crate::record::{Collection, Reversal, RunResults};
 use crate::tensorboard::Events;
 use crate::{Error, Progress, Result, Stop};
-use e2h_core::{Direction, Episode, Kind, Origin, stream};
-use e2h_data::{Normaliser, NormaliserConfig};
-use e2h_env::{Env, Task, demonstrate};
+use e2h_core::{Direction, Episode, Kind, Origin, Policy, stream};
+use e2h_data::{Normaliser, NormaliserConfig, Source};
+use e2h_env::{Env, Task, TaskOptions, demonstrate};
 use e2h_nn::Compute;
-use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData, train_critic};
-use e2h_refine::{Goal, Refined, critic_filter, gate, kinematic_filter, reverse};
-use serde::{Deserialize, Serialize};
+use e2h_policy::{Critic, CriticReport, Provenance, train_critic};
+use e2h_refine::{kinematic_filter, reverse};
+use stage::PolicyStage;
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
+
+pub use stage::{Json, Stored};
 
 /// What a run is started with.
 #[derive(Debug, Clone)]
@@ -32,16 +38,18 @@ pub struct RunOptions {
     pub task: String,
     /// Preset name.
     pub preset: String,
+    /// Method name ([`methods::registry`]).
+    pub method: String,
     /// Seed of everything random.
     pub seed: u64,
     /// `key.path=value` overrides.
     pub set: Vec<String>,
-    /// The run directory; by default `runs/<task>-<preset>-<seed>`.
+    /// The run directory; by default `runs/<task>-<preset>-<seed>`, with the method before the seed if it is not `auto-e2h`.
     pub out: Option<PathBuf>,
     /// Go on with a run directory that exists.
     pub resume: bool,
-    /// Where networks are computed: `cpu`, `cuda` or `cuda:N`. Not part of a run: it may go on elsewhere, and then ends
-    /// with other last digits.
+    /// Where networks are computed: `cpu`, `cuda` or `cuda:N`. Not part of a run: it may go on elsewhere, and its results may
+    /// then differ in the last bits.
     pub device: String,
     /// Threads; by default as many as there are cores. Never changes a result.
     pub threads: Option<usize>,
@@ -53,6 +61,41 @@ pub struct RunOptions {
     pub stop: Stop,
 }
 
+impl RunOptions {
+    /// The defaults of the command line: preset `laptop`, method `auto-e2h`, seed 0.
+    #[must_use]
+    pub fn new(task: &str) -> Self {
+        Self {
+            task: task.to_owned(),
+            preset: "laptop".to_owned(),
+            method: methods::DEFAULT.to_owned(),
+            seed: 0,
+            set: vec![],
+            out: None,
+            resume: false,
+            device: "cpu".to_owned(),
+            threads: None,
+            quiet: false,
+            tensorboard: false,
+            stop: Stop::default(),
+        }
+    }
+}
+
+/// Builds a task of the variant, clearance and demonstrator that a configuration says.
+pub type BuildTask = Arc<dyn Fn(&TaskOptions) -> e2h_env::Result<Arc<dyn Task>> + Send + Sync>;
+
+/// Parts of a run that are one's own; what is none comes from the registries.
+#[derive(Default, Clone)]
+pub struct Parts {
+    /// A task pair: the text of its configuration file, which names it and is laid over the preset, and what builds it.
+    pub task: Option<(String, BuildTask)>,
+    /// A method. The values of the method that [`RunOptions::method`] names are laid over the task file all the same.
+    pub method: Option<Arc<dyn Method>>,
+    /// A class of policies.
+    pub policy: Option<Arc<dyn PolicyClass>>,
+}
+
 /// A run in progress.
 pub struct Run {
     options: RunOptions,
@@ -61,45 +104,52 @@ pub struct Run {
     progress: Progress,
     compute: Compute,
     task: Arc<dyn Task>,
+    method: Arc<dyn Method>,
+    class: Arc<dyn PolicyClass>,
     env: Env,
 }
 
 /// Demonstrations and what is fitted on them.
-pub struct Base {
+pub struct Demonstrations {
     /// Easy demonstrations as recorded.
     pub easy: Vec<Episode>,
     /// `D_e^(0)`: what the easy policy learns from.
     pub easy_training: Vec<Arc<Episode>>,
     /// `D_h^(0)`: the reversed demonstrations.
-    pub hard_training: Vec<Arc<Episode>>,
+    pub hard: Vec<Arc<Episode>>,
     /// Scaling, fitted on `D_h^(0)`.
     pub normaliser: Normaliser,
 }
 
-/// Easy rollouts of one iteration, refined.
+/// What a round brought.
 pub struct Accepted {
-    /// Segments for training.
+    /// Segments for training the hard policy.
     pub segments: Vec<Arc<Episode>>,
+    /// What the easy policy has done well, for training it; none where it stays as it is.
+    pub easy: Vec<Arc<Episode>>,
     /// What collection brought and what refinement made of it.
     pub collection: Collection,
+    /// Minutes of collection, refinement and critic.
+    pub stage_minutes: BTreeMap<String, f64>,
 }
 
-#[derive(Serialize, Deserialize)]
-struct AcceptedNotes {
-    collection: Collection,
-    stage_minutes: BTreeMap<String, f64>,
-    /// SHA-256 of what lies beside the segments. Runs of version 0.1 have none.
-    #[serde(default)]
-    files: BTreeMap<String, String>,
+/// What [`Tools`] of a method call.
+pub(crate) trait Toolbox {
+    fn critic(&self, round: &Round<'_>) -> Result<(Critic, CriticReport)>;
+    fn demonstrate(&self, direction: Direction) -> Result<Vec<Episode>>;
 }
 
-#[derive(Serialize, Deserialize)]
-struct TrainNotes {
-    minutes: f64,
-    loss: f64,
-    /// Of `policy.json`, which has that of the weights. Runs of version 0.1 have none.
-    #[serde(default)]
-    policy_sha256: Option<String>,
+/// One training stage of a run.
+struct Stage<'a> {
+    /// Folder, below the run's.
+    place: String,
+    /// What the progress bar says.
+    name: String,
+    direction: Direction,
+    iteration: u32,
+    steps: usize,
+    sources: Vec<Source>,
+    start: Option<&'a dyn Trained>,
 }
 
 impl Run {
@@ -109,26 +159,60 @@ impl Run {
     /// A configuration that cannot work, an unknown task, a device that is not there, a run directory that exists (without `resume`) or is another
     /// run's.
     pub fn open(options: &RunOptions) -> Result<Self> {
+        Self::open_with(options, &Parts::default())
+    }
+
+    /// The same with a task pair, a method or a class of policies of one's own.
+    ///
+    /// # Errors
+    /// As [`Run::open`].
+    pub fn open_with(options: &RunOptions, parts: &Parts) -> Result<Self> {
         e2h_nn::tune_allocator();
-        let mut resolved = RunConfig::resolve(&options.preset, &options.task, &options.set)?;
+        let entry = methods::find(&options.method)?;
+        let (code, values) = entry.read()?;
+        let own = parts.task.as_ref();
+        let text = own.map(|(text, _)| text.as_str());
+        let mut resolved =
+            RunConfig::resolve_with(&options.preset, &options.task, text, &values, &options.set)?;
         if let Some(n) = options.threads {
             set_threads(n)?;
         }
+        let task_options = resolved.config.task.options();
+        let task = match own {
+            Some((_, build)) => build(&task_options)?,
+            None => e2h_env::task(&options.task, &task_options)?,
+        };
+        if task.name() != options.task {
+            let (expected, found) = (&options.task, e2h_core::one_line(task.name()));
+            return Err(Error::Config(format!("task: expected one named `{expected}`, got `{found}`")));
+        }
+        resolved.config.know(&*task);
         let config = &resolved.config;
         let compute = Compute::open(&options.device, config.device)?;
-        let task = e2h_env::task(&config.task.name, &config.task.options())?;
         let mut env = Env::new(task.clone(), &config.env)?;
         if !config.policy.cameras.is_empty() {
             env.select_cameras(&config.policy.cameras)?;
         }
         let path = options.out.clone().unwrap_or_else(|| {
-            PathBuf::from(format!("runs/{}-{}-{}", options.task, options.preset, options.seed))
+            let method = match options.method.as_str() {
+                methods::DEFAULT => String::new(),
+                other => format!("{other}-"),
+            };
+            PathBuf::from(format!("runs/{}-{}-{method}{}", options.task, options.preset, options.seed))
         });
-        let dir = Directory::open(&path, options.resume, &options.task, options.seed, &resolved)?;
+        let dir = Directory::open(&path, options, &resolved, &*task)?;
         let progress = Progress::new(options.quiet).stopping(options.stop.clone());
-        // Known to the task, not to be chosen.
-        resolved.config.refine.reverse.object_reference = Some(task.object_reference());
-        Ok(Self { options: options.clone(), resolved, dir, progress, compute, task, env })
+        Ok(Self {
+            options: options.clone(),
+            resolved,
+            dir,
+            progress,
+            compute,
+            task,
+            method: parts.method.clone().unwrap_or(code),
+            class: parts.policy.clone().unwrap_or_else(|| Arc::new(Diffusion)),
+            env,
+        })
     }
 
     /// The resolved configuration.
@@ -141,6 +225,12 @@ impl Run {
     #[must_use]
     pub fn path(&self) -> &Path {
         self.dir.path()
+    }
+
+    /// The task pair of the run.
+    #[must_use]
+    pub fn task(&self) -> &Arc<dyn Task> {
+        &self.task
     }
 
     /// Updates of the hard policy.
@@ -165,58 +255,32 @@ impl Run {
         }
     }
 
+    /// All of algorithm 1, as `examples/nut_assembly.rs` spells it out; returns the results and the report's path.
+    ///
+    /// # Errors
+    /// Those of the stages.
+    pub fn learn(&self) -> Result<(RunResults, PathBuf)> {
+        let demonstrations = self.demonstrations()?;
+        let mut easy = self.train_easy(&demonstrations)?;
+        let mut hard = self.train_initial(&demonstrations)?;
+        let mut records = vec![self.evaluate(0, &*hard, None)?];
+        let mut rounds = vec![];
+        for n in 1..=self.iterations() {
+            rounds.push(self.lesson(n, &demonstrations, &*hard, || self.collect(n, &*hard, &*easy))?);
+            hard = self.update(n, &*hard, &demonstrations, &rounds)?;
+            easy = self.update_easy(n, easy, &demonstrations, &rounds)?;
+            records.push(self.evaluate(n, &*hard, rounds.last())?);
+        }
+        self.report(&demonstrations, records)
+    }
+
     /// Records the easy demonstrations and reverses them into `D_h^(0)`.
     ///
     /// # Errors
     /// When the demonstrator fails more often than it succeeds, or the folder cannot be written.
-    pub fn demonstrations(&self) -> Result<Base> {
+    pub fn demonstrations(&self) -> Result<Demonstrations> {
         let c = self.config();
-        let easy = match self.dir.get_episodes::<BTreeMap<String, f64>>("demonstrations")? {
-            Some((episodes, _)) => episodes,
-            None => {
-                let start = Instant::now();
-                let wanted = c.closed_loop.demonstrations;
-                let bar = self.progress.bar("easy demonstrations", wanted as u64);
-                let mut env = self.env.clone_shared()?;
-                let mut episodes = Vec::with_capacity(wanted);
-                let mut failed = 0;
-                let mut index = 0;
-                while episodes.len() < wanted {
-                    self.progress.check()?;
-                    let origin =
-                        Origin::demonstration(&self.options.task, Direction::Easy, index, self.options.seed);
-                    let mut rng = stream(self.options.seed, "demonstrate", 0, u64::from(index));
-                    let episode = match demonstrate(
-                        &mut env,
-                        Direction::Easy,
-                        &c.task.demonstrator,
-                        origin,
-                        &mut rng,
-                    ) {
-                        Err(e2h_env::Error::Diverged(_)) => None,
-                        recorded => Some(recorded?).filter(|e| e.outcome.is_success()),
-                    };
-                    index += 1;
-                    if let Some(episode) = episode {
-                        episodes.push(episode);
-                    } else {
-                        failed += 1;
-                        if failed > wanted {
-                            return Err(Error::Demonstrations(format!(
-                                "the scripted demonstrator failed {failed} times for {} successes",
-                                episodes.len()
-                            )));
-                        }
-                    }
-                    bar.set(episodes.len() as u64, &format!("{failed} failed"));
-                }
-                let minutes = start.elapsed().as_secs_f64() / 60.0;
-                let notes = BTreeMap::from([("minutes".to_owned(), minutes)]);
-                self.dir.put_episodes("demonstrations", &episodes, &notes)?;
-                bar.finish(&format!("{wanted} recorded, {failed} failed"));
-                episodes
-            }
-        };
+        let easy = self.demonstrate(Direction::Easy)?;
         let r = &c.refine;
         let reversed = |e: &Episode| -> Vec<Episode> {
             let hard = reverse(e, &r.reverse);
@@ -227,86 +291,15 @@ impl Run {
             }
         };
         let hard: Vec<Episode> = easy.iter().flat_map(reversed).collect();
-        let easy_training: Vec<Episode> = easy.iter().flat_map(|e| self.easy_lessons(e.clone())).collect();
+        let easy_training = easy.iter().flat_map(|e| self.easy_lessons(e.clone()));
         let config = NormaliserConfig { margin: c.train.normaliser_margin, ..NormaliserConfig::default() };
         let normaliser = Normaliser::fit(&hard, &config)?;
-        Ok(Base {
-            easy_training: easy_training.into_iter().map(Arc::new).collect(),
-            hard_training: hard.into_iter().map(Arc::new).collect(),
+        Ok(Demonstrations {
+            easy_training: easy_training.map(Arc::new).collect(),
+            hard: hard.into_iter().map(Arc::new).collect(),
             easy,
             normaliser,
         })
-    }
-
-    /// Trains the easy policy, once.
-    ///
-    /// # Errors
-    /// When training diverges or the folder cannot be written.
-    pub fn train_easy(&self, base: &Base) -> Result<DiffusionPolicy> {
-        let steps = self.config().train.easy_steps;
-        let data = (&base.easy_training[..], &[][..]);
-        self.train("policy_easy", "train easy", Direction::Easy, 0, steps, base, data, None)
-    }
-
-    /// Trains the initial hard policy on `D_h^(0)`.
-    ///
-    /// # Errors
-    /// As [`Run::train_easy`].
-    pub fn train_initial(&self, base: &Base) -> Result<DiffusionPolicy> {
-        let steps = self.config().train.initial_steps;
-        let data = (&base.hard_training[..], &[][..]);
-        self.train(&folder(0, "policy"), "train hard 0", Direction::Hard, 0, steps, base, data, None)
-    }
-
-    /// Trains the hard policy on `D_h^(0)` and the accepted segments, from where it is or from fresh weights as
-    /// `train.update_from` says; with no segments it stays as it is.
-    ///
-    /// # Errors
-    /// As [`Run::train_easy`].
-    pub fn update(
-        &self,
-        iteration: u32,
-        policy: &DiffusionPolicy,
-        base: &Base,
-        accepted: &[Arc<Episode>],
-    ) -> Result<DiffusionPolicy> {
-        let steps = if accepted.is_empty() { 0 } else { self.config().train.update_steps };
-        let fresh = steps > 0 && self.config().train.update_from == UpdateFrom::Scratch;
-        let data = (&base.hard_training[..], accepted);
-        let name = format!("train hard {iteration}");
-        self.train(
-            &folder(iteration, "policy"),
-            &name,
-            Direction::Hard,
-            iteration,
-            steps,
-            base,
-            data,
-            (!fresh).then_some(policy),
-        )
-    }
-
-    /// Continues the easy policy on `D_e^(0)` and what it has done well in the loop so far, exploration included; where
-    /// `train.easy_update_steps` is 0 it stays as it is.
-    ///
-    /// # Errors
-    /// As [`Run::train_easy`].
-    pub fn update_easy(&self, iteration: u32, easy: DiffusionPolicy, base: &Base) -> Result<DiffusionPolicy> {
-        let mut own = vec![];
-        if self.config().train.easy_update_steps > 0 && iteration < self.iterations() {
-            for n in 1..=iteration {
-                let found = self.dir.get_episodes::<usize>(&folder(n, "easy_segments"))?;
-                own.extend(found.into_iter().flat_map(|(segments, _)| segments).map(Arc::new));
-            }
-        }
-        if own.is_empty() {
-            return Ok(easy);
-        }
-        let steps = self.config().train.easy_update_steps;
-        let place = folder(iteration, "policy_easy");
-        let name = format!("train easy {iteration}");
-        let data = (&base.easy_training[..], &own[..]);
-        self.train(&place, &name, Direction::Easy, iteration, steps, base, data, Some(&easy))
     }
 
     /// What the easy policy learns of an episode of its own task.
@@ -319,87 +312,255 @@ impl Run {
         }
     }
 
-    #[allow(
-        clippy::too_many_arguments,
-        reason = "one private place where all that differs between stages meets"
-    )]
-    fn train(
+    /// Trains the easy policy, once.
+    ///
+    /// # Errors
+    /// When training diverges or the folder cannot be written.
+    pub fn train_easy(&self, demonstrations: &Demonstrations) -> Result<Box<dyn Trained>> {
+        let stage = Stage {
+            place: "policy_easy".to_owned(),
+            name: "train easy".to_owned(),
+            direction: Direction::Easy,
+            iteration: 0,
+            steps: self.config().train.easy_steps,
+            sources: vec![Source::whole(demonstrations.easy_training.clone())],
+            start: None,
+        };
+        self.train(stage, &demonstrations.normaliser)
+    }
+
+    /// Trains the initial hard policy on what the method begins with: `D_h^(0)`.
+    ///
+    /// # Errors
+    /// As [`Run::train_easy`].
+    pub fn train_initial(&self, demonstrations: &Demonstrations) -> Result<Box<dyn Trained>> {
+        let stage = Stage {
+            place: folder(0, "policy"),
+            name: "train hard 0".to_owned(),
+            direction: Direction::Hard,
+            iteration: 0,
+            steps: self.config().train.initial_steps,
+            sources: self.method.initial(demonstrations, self.config(), &Tools::new(self))?,
+            start: None,
+        };
+        self.train(stage, &demonstrations.normaliser)
+    }
+
+    /// What the rounds teach: `make` collects, the method makes a lesson of it, and its segments are stored. Where an earlier
+    /// process did so, nothing is collected.
+    ///
+    /// # Errors
+    /// When collection fails, the critic's training diverges, or the folder cannot be written.
+    pub fn lesson(
         &self,
-        place: &str,
-        name: &str,
-        direction: Direction,
         iteration: u32,
-        steps: usize,
-        base: &Base,
-        data: (&[Arc<Episode>], &[Arc<Episode>]),
-        start: Option<&DiffusionPolicy>,
-    ) -> Result<DiffusionPolicy> {
+        demonstrations: &Demonstrations,
+        policy: &dyn Trained,
+        make: impl FnOnce() -> Result<Collected>,
+    ) -> Result<Accepted> {
+        self.stage(&folder(iteration, "segments"), || {
+            let clock = Instant::now();
+            let rollouts = make()?;
+            let collect = clock.elapsed();
+            let round =
+                Round { config: self.config(), iteration, demonstrations, rollouts: &rollouts, policy };
+            let clock = Instant::now();
+            let lesson = self.method.lesson(&round, &Tools::new(self))?;
+            let refine = clock.elapsed().saturating_sub(lesson.critic_time);
+            let minutes = [("collect", collect), ("refine", refine), ("critic", lesson.critic_time)];
+            let minutes = minutes.map(|(stage, t)| (stage.to_owned(), t.as_secs_f64() / 60.0));
+            self.account(iteration, rollouts, lesson, BTreeMap::from(minutes))
+        })
+    }
+
+    /// Closed-loop collection with both policies.
+    ///
+    /// # Errors
+    /// When the simulation fails, or rollouts are to be kept and cannot be written.
+    pub fn collect(&self, iteration: u32, hard: &dyn Policy, easy: &dyn Policy) -> Result<Collected> {
+        let c = &self.config().closed_loop;
+        let collected = collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)?;
+        let place = folder(iteration, "rollouts");
+        if c.keep_rollouts && !self.dir.join(&place).exists() {
+            let mut all: Vec<&Episode> =
+                collected.hard.iter().chain(&collected.easy).chain(&collected.rejected).collect();
+            // As they happened: of a cycle the hard rollout, then the easy one.
+            all.sort_by_key(|e| (e.origin.episode, e.origin.direction == Direction::Easy));
+            self.dir.put_episodes(&place, &all, &collected.resets)?;
+        }
+        Ok(collected)
+    }
+
+    /// Pictures and record of a round.
+    fn account(
+        &self,
+        iteration: u32,
+        rollouts: Collected,
+        lesson: Lesson,
+        stage_minutes: BTreeMap<String, f64>,
+    ) -> Result<Accepted> {
         let c = self.config();
-        let notes_file = format!("{place}/notes.json");
-        let description = format!("{place}/policy.json");
-        if let Some(notes) = self.dir.get::<TrainNotes>(&notes_file)? {
-            self.dir.verify(&description, notes.policy_sha256.as_deref())?;
-            return Ok(DiffusionPolicy::load(&self.dir.join(place))?.0.on(&self.compute)?);
+        let Lesson { candidates, refined, critic, notes, .. } = lesson;
+        let mut fates = BTreeMap::new();
+        for fate in refined.iter().flat_map(|r| &r.fates) {
+            *fates.entry(picture::fate_name(*fate).to_owned()).or_default() += 1;
         }
-        let clock = Instant::now();
-        let share = c.closed_loop.base_share;
-        let data = TrainingData::new(data.0, data.1, share, &c.policy, &base.normaliser)?;
-        let weights = start.map(DiffusionPolicy::weights).transpose()?;
-        let purpose = format!("train/{direction}/{iteration}");
-        let mut trainer =
-            Trainer::new(&c.policy, &c.train.step, steps, weights.as_ref(), self.options.seed, &purpose)?
-                .on(&self.compute)?;
-        let saved = self.dir.join(format!("{place}/{TRAINING}"));
-        if saved.exists() {
-            trainer.restore(&saved)?;
+        if let Some((episode, refined)) = candidates.iter().zip(&refined).next() {
+            let svg = picture::filter(episode, refined, &c.refine.kinematic)?;
+            write_atomic(&self.dir.join(folder(iteration, "filter.svg")), svg.as_bytes())?;
         }
-        let mut events = match trainer.step_count() {
-            done if done < steps => self.events(&format!("train_{direction}_{iteration:02}"), done as u64)?,
-            _ => None,
+        let reversals: Vec<Reversal> =
+            candidates.iter().zip(&refined).map(|(e, r)| Reversal::new(e, r)).collect();
+        self.dir.put_compact(&folder(iteration, "reversals.json"), &reversals)?;
+        let hard_successes = rollouts.hard.iter().filter(|e| e.outcome.is_success()).count();
+        let easy: Vec<Arc<Episode>> = if c.train.easy_update_steps > 0 {
+            rollouts.easy.into_iter().flat_map(|e| self.easy_lessons(e)).map(Arc::new).collect()
+        } else {
+            vec![]
         };
-        let bar = self.progress.bar(name, steps as u64);
-        let save = |trainer: &Trainer| {
-            let folder = self.dir.join(place);
-            std::fs::create_dir_all(&folder).map_err(crate::directory::io("creating", &folder))?;
-            Ok::<(), Error>(trainer.save(&saved)?)
+        let segments: Vec<Arc<Episode>> =
+            refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty()).map(Arc::new).collect();
+        let collection = Collection {
+            cycles: c.closed_loop.cycles,
+            hard_successes,
+            easy_successes: rollouts.easy_successes,
+            easy_rollouts: rollouts.easy_rollouts,
+            resets: rollouts.resets,
+            explored: rollouts.explored,
+            plain: rollouts.plain,
+            accepted: candidates.len(),
+            fates,
+            segments: segments.len(),
+            frames_kept: segments.iter().map(|e| e.len()).sum(),
+            critic_loss: critic.map(|report| report.validation_loss.unwrap_or(report.train_loss)),
+            notes,
         };
-        while trainer.step_count() < steps {
-            if let Err(stopped) = self.progress.check() {
-                save(&trainer)?;
-                return Err(stopped);
-            }
-            let loss = trainer.step(&data)?;
-            let done = trainer.step_count();
-            if let Some(events) = &mut events {
-                events.scalar("train/loss", done as u64, now(), loss.into())?;
-            }
-            if done % 10 == 0 {
-                events.as_mut().map_or(Ok(()), Events::flush)?;
-                bar.set(done as u64, &format!("loss {:.4}", trainer.mean_loss()));
-            }
-            if done % c.train.save_every == 0 && done < steps {
-                save(&trainer)?;
-            }
-        }
-        events.map(Events::finish).transpose()?;
-        let loss = trainer.mean_loss();
-        let weights = match (steps, weights) {
-            (0, Some(weights)) => weights,
-            _ => trainer.weights()?,
+        Ok(Accepted { segments, easy, collection, stage_minutes })
+    }
+
+    /// Trains the hard policy on what the method makes of the rounds so far, from where it is or from fresh weights as
+    /// `train.update_from` says; after a round that brought nothing it stays as it is.
+    ///
+    /// # Errors
+    /// As [`Run::train_easy`].
+    pub fn update(
+        &self,
+        iteration: u32,
+        policy: &dyn Trained,
+        demonstrations: &Demonstrations,
+        rounds: &[Accepted],
+    ) -> Result<Box<dyn Trained>> {
+        let c = self.config();
+        let segments: Vec<&[Arc<Episode>]> = rounds.iter().map(|r| &r.segments[..]).collect();
+        let learned = if c.closed_loop.accumulate {
+            &segments[..]
+        } else {
+            &segments[segments.len().saturating_sub(1)..]
         };
-        let policy =
-            DiffusionPolicy::with_weights(&c.policy, &base.normaliser, &weights)?.on(&self.compute)?;
-        policy.save(&self.dir.join(place), &self.provenance(direction, iteration)?)?;
-        let minutes = clock.elapsed().as_secs_f64() / 60.0;
-        self.dir.put_sealed(
-            &notes_file,
-            &TrainNotes { minutes, loss, policy_sha256: Some(self.dir.sha256(&description)?) },
-        )?;
-        if saved.exists() {
-            std::fs::remove_file(&saved).map_err(crate::directory::io("removing", &saved))?;
+        let steps = if learned.iter().all(|s| s.is_empty()) { 0 } else { c.train.update_steps };
+        let fresh = steps > 0 && c.train.update_from == UpdateFrom::Scratch;
+        let stage = Stage {
+            place: folder(iteration, "policy"),
+            name: format!("train hard {iteration}"),
+            direction: Direction::Hard,
+            iteration,
+            steps,
+            sources: self.method.sources(demonstrations, &segments, c),
+            start: (!fresh).then_some(policy),
+        };
+        self.train(stage, &demonstrations.normaliser)
+    }
+
+    /// Continues the easy policy on `D_e^(0)` and what it has done well in the loop so far, exploration included; where
+    /// `train.easy_update_steps` is 0, and after the last round, it stays as it is.
+    ///
+    /// # Errors
+    /// As [`Run::train_easy`].
+    pub fn update_easy(
+        &self,
+        iteration: u32,
+        easy: Box<dyn Trained>,
+        demonstrations: &Demonstrations,
+        rounds: &[Accepted],
+    ) -> Result<Box<dyn Trained>> {
+        let own: Vec<_> = rounds.iter().flat_map(|r| r.easy.iter().cloned()).collect();
+        let steps = self.config().train.easy_update_steps;
+        if own.is_empty() || steps == 0 || iteration >= self.iterations() {
+            return Ok(easy);
         }
-        bar.finish(&format!("{steps} steps, loss {loss:.4}"));
-        Ok(policy)
+        let share = self.config().closed_loop.base_share;
+        let stage = Stage {
+            place: folder(iteration, "policy_easy"),
+            name: format!("train easy {iteration}"),
+            direction: Direction::Easy,
+            iteration,
+            steps,
+            sources: vec![
+                Source { episodes: demonstrations.easy_training.clone(), share },
+                Source { episodes: own, share: 1.0 - share },
+            ],
+            start: Some(&*easy),
+        };
+        self.train(stage, &demonstrations.normaliser)
+    }
+
+    fn train(&self, stage: Stage<'_>, normaliser: &Normaliser) -> Result<Box<dyn Trained>> {
+        let Stage { place, name, direction, iteration, steps, sources, start } = stage;
+        let provenance = self.provenance(direction, iteration)?;
+        let done = self.stage(&place, || {
+            let clock = Instant::now();
+            let spent = self.spent(&place)?;
+            let c = self.config();
+            let bar = self.progress.bar(&name, steps as u64);
+            let weights = start.map(Trained::weights).transpose()?;
+            let purpose = format!("train/{direction}/{iteration}");
+            let mut training = self.class.train(Job {
+                config: c,
+                sources: &sources,
+                normaliser,
+                steps,
+                start: weights.as_ref(),
+                seed: self.options.seed,
+                purpose: &purpose,
+                compute: &self.compute,
+            })?;
+            let saved = self.dir.join(format!("{place}/{TRAINING}"));
+            if saved.exists() {
+                training.restore(&saved)?;
+            }
+            let mut events = match training.step_count() {
+                done if done < steps => {
+                    self.events(&format!("train_{direction}_{iteration:02}"), done as u64)?
+                }
+                _ => None,
+            };
+            while training.step_count() < steps {
+                let stopped = self.progress.check();
+                let done = training.step_count();
+                let due = done % c.train.save_every == 0 && done > 0;
+                if stopped.is_err() || due {
+                    let folder = self.dir.join(&place);
+                    std::fs::create_dir_all(&folder).map_err(crate::directory::io("creating", &folder))?;
+                    training.save(&saved)?;
+                    self.spend(&place, spent + clock.elapsed().as_secs_f64() / 60.0)?;
+                }
+                stopped?;
+                let loss = training.step()?;
+                let done = training.step_count();
+                if let Some(events) = &mut events {
+                    events.scalar("train/loss", done as u64, now(), loss.into())?;
+                }
+                if done % 10 == 0 {
+                    events.as_mut().map_or(Ok(()), Events::flush)?;
+                    bar.set(done as u64, &format!("loss {:.4}", training.mean_loss()));
+                }
+            }
+            events.map(Events::finish).transpose()?;
+            let loss = training.mean_loss();
+            bar.finish(&format!("{steps} steps, loss {loss:.4}"));
+            Ok(PolicyStage { policy: training.policy()?, loss, provenance })
+        })?;
+        Ok(done.policy)
     }
 
     /// An event file of one stage, which starts or goes on at `step`; none when nobody asked for them. Each stage has a folder:
@@ -421,226 +582,84 @@ impl Run {
             run,
         })
     }
-
-    /// What an earlier process of this run accepted in `iteration`, if it got that far.
-    ///
-    /// # Errors
-    /// When the folder cannot be read.
-    pub fn stored(&self, iteration: u32) -> Result<Option<Accepted>> {
-        let found = self.dir.get_episodes::<AcceptedNotes>(&folder(iteration, "segments"))?;
-        found.iter().try_for_each(|(_, notes)| self.dir.verify_seals(&notes.files))?;
-        Ok(found.map(|(segments, notes)| Accepted {
-            segments: segments.into_iter().map(Arc::new).collect(),
-            collection: notes.collection,
-        }))
-    }
-
-    /// What the update of `iteration` learns from besides `D_h^(0)`: this iteration's segments, with all earlier ones where
-    /// the configuration accumulates.
-    ///
-    /// # Errors
-    /// When an earlier iteration's folder cannot be read.
-    pub fn training_set(&self, iteration: u32, accepted: &Accepted) -> Result<Vec<Arc<Episode>>> {
-        let mut all = vec![];
-        if self.config().closed_loop.accumulate {
-            for earlier in 1..iteration {
-                all.extend(self.stored(earlier)?.map(|a| a.segments).unwrap_or_default());
-            }
-        }
-        all.extend(accepted.segments.iter().cloned());
-        Ok(all)
-    }
-
-    /// Closed-loop collection with both policies.
-    ///
-    /// # Errors
-    /// When the simulation fails, or rollouts are to be kept and cannot be written.
-    pub fn collect(
-        &self,
-        iteration: u32,
-        hard: &DiffusionPolicy,
-        easy: &DiffusionPolicy,
-    ) -> Result<Collected> {
-        let c = &self.config().closed_loop;
-        let collected = collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)?;
-        let place = folder(iteration, "rollouts");
-        if c.keep_rollouts && !self.dir.join(&place).exists() {
-            let mut all: Vec<&Episode> =
-                collected.hard.iter().chain(&collected.easy).chain(&collected.rejected).collect();
-            // As they happened: of a cycle the hard rollout, then the easy one.
-            all.sort_by_key(|e| (e.origin.episode, e.origin.direction == Direction::Easy));
-            self.dir.put_episodes(&place, &all, &collected.resets)?;
-        }
-        Ok(collected)
-    }
-
-    /// Reverses and refines the easy rollouts of one iteration, with a critic trained on its hard rollouts.
-    ///
-    /// # Errors
-    /// When the critic's training diverges or the folder cannot be written.
-    pub fn refine(
-        &self,
-        iteration: u32,
-        collected: Collected,
-        collect_time: Duration,
-        base: &Base,
-        policy: &DiffusionPolicy,
-    ) -> Result<Accepted> {
-        let c = self.config();
-        let r = &c.refine;
-        let clock = Instant::now();
-        let mut notes = vec![];
-        let reversed: Vec<Episode> = collected.easy.iter().map(|e| reverse(e, &r.reverse)).collect();
-        let mut candidates: Vec<Episode> =
-            reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
-        if let Some(goal) = Goal::fit(&base.hard_training, &r.goal) {
-            let before = candidates.len();
-            if r.goal.enabled {
-                candidates.retain(|e| goal.accepts(e));
-            }
-            notes.push(goal_note(&goal, &collected.hard, candidates.len(), before));
-        }
-        let kinematic: Vec<Refined> = candidates
-            .iter()
-            .map(|e| {
-                if r.kinematic_enabled {
-                    kinematic_filter(e, &r.kinematic, &r.reverse)
-                } else {
-                    Refined::untouched(e)
-                }
-            })
-            .collect();
-        let refine_minutes = clock.elapsed().as_secs_f64() / 60.0;
-
-        let clock = Instant::now();
-        let successes = collected.hard.iter().filter(|e| e.outcome.is_success()).count();
-        let mut critic_loss = None;
-        let refined = if !c.critic.enabled {
-            notes.push("critic: switched off".to_owned());
-            kinematic
-        } else if successes == 0 {
-            notes.push("critic: skipped, no hard rollout succeeded".to_owned());
-            kinematic
-        } else if candidates.is_empty() {
-            notes.push("critic: skipped, nothing to filter".to_owned());
-            kinematic
-        } else {
-            let name = format!("critic {iteration}");
-            let network = &c.critic.network;
-            let bar = self.progress.bar(&name, network.steps as u64);
-            let trained = train_critic(
-                &c.policy,
-                network,
-                &self.compute,
-                &base.normaliser,
-                &policy.weights()?,
-                &collected.hard,
-                c.env.horizon_hard,
-                self.options.seed,
-                &format!("critic/{iteration}"),
-                |step, loss| {
-                    bar.set(step as u64, &format!("loss {loss:.4}"));
-                    if self.progress.check().is_ok() {
-                        ControlFlow::Continue(())
-                    } else {
-                        ControlFlow::Break(())
-                    }
-                },
-            );
-            let (critic, report) = match trained {
-                Err(e2h_policy::Error::Stopped { .. }) => {
-                    return Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }));
-                }
-                done => done?,
-            };
-            bar.finish(&format!(
-                "loss {:.4}, held out {:.4}",
-                report.train_loss,
-                report.validation_loss.unwrap_or(f64::NAN)
-            ));
-            if let Some(mut events) = self.events(&format!("critic_{iteration:02}"), 0)? {
-                for (step, &loss) in report.losses.iter().enumerate() {
-                    events.scalar("critic/loss", step as u64 + 1, now(), loss.into())?;
-                }
-                events.finish()?;
-            }
-            critic_loss = report.validation_loss.or(Some(report.train_loss));
-            let values = kinematic
-                .iter()
-                .flat_map(|k| &k.segments)
-                .map(|segment| critic.evaluate(segment))
-                .collect::<std::result::Result<Vec<_>, _>>()?;
-            let suffix = r.suffix.trusting(successes);
-            if suffix.enabled != r.suffix.enabled {
-                let needed = r.suffix.min_successes;
-                notes.push(format!("suffix: not cut, the critic has seen {successes} successes of {needed}"));
-            }
-            critic_filter(kinematic, &values, &suffix, &r.advantage)?
-        };
-        let critic_minutes = clock.elapsed().as_secs_f64() / 60.0;
-
-        let mut fates = BTreeMap::new();
-        for fate in refined.iter().flat_map(|r| &r.fates) {
-            *fates.entry(picture::fate_name(*fate).to_owned()).or_default() += 1;
-        }
-        if let Some((episode, refined)) = candidates.iter().zip(&refined).next() {
-            let svg = picture::filter(episode, refined, &r.kinematic)?;
-            write_atomic(&self.dir.join(folder(iteration, "filter.svg")), svg.as_bytes())?;
-        }
-        let reversals: Vec<Reversal> =
-            candidates.iter().zip(&refined).map(|(e, r)| Reversal::new(e, r)).collect();
-        self.dir.put_compact(&folder(iteration, "reversals.json"), &reversals)?;
-        if c.train.easy_update_steps > 0 {
-            let own: Vec<Episode> =
-                collected.easy.iter().flat_map(|e| self.easy_lessons(e.clone())).collect();
-            self.dir.put_episodes(&folder(iteration, "easy_segments"), &own, &own.len())?;
-        }
-        let segments: Vec<Episode> =
-            refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty()).collect();
-        let collection = Collection {
-            cycles: c.closed_loop.cycles,
-            hard_successes: successes,
-            easy_successes: collected.easy_successes,
-            easy_rollouts: collected.easy_rollouts,
-            resets: collected.resets,
-            explored: collected.explored,
-            plain: collected.plain,
-            accepted: candidates.len(),
-            fates,
-            segments: segments.len(),
-            frames_kept: segments.iter().map(Episode::len).sum(),
-            critic_loss,
-            notes,
-        };
-        let stage_minutes = BTreeMap::from([
-            ("collect".to_owned(), collect_time.as_secs_f64() / 60.0),
-            ("refine".to_owned(), refine_minutes),
-            ("critic".to_owned(), critic_minutes),
-        ]);
-        let files = self.dir.seals(&["filter.svg", "reversals.json"].map(|f| folder(iteration, f)))?;
-        let stored = AcceptedNotes { collection, stage_minutes, files };
-        self.dir.put_episodes(&folder(iteration, "segments"), &segments, &stored)?;
-        Ok(Accepted { segments: segments.into_iter().map(Arc::new).collect(), collection: stored.collection })
-    }
-
-    /// The task pair of the run.
-    #[must_use]
-    pub fn task(&self) -> &Arc<dyn Task> {
-        &self.task
-    }
 }
 
-/// Where successes leave the object: what tells a loop that walks to the edge of its goal from one that does not.
-fn goal_note(goal: &Goal, hard: &[Episode], kept: usize, of: usize) -> String {
-    let successes = hard.iter().filter(|e| e.outcome.is_success());
-    let mut ends: Vec<f64> = successes.filter_map(|e| goal.distance(e)).collect();
-    ends.sort_by(f64::total_cmp);
-    let median = ends.get(ends.len() / 2).map_or_else(|| "no".to_owned(), |d| format!("{:.1}", 1000.0 * d));
-    format!(
-        "goals: successes end {median} mm from the mean demonstrated goal (median), the gate is at {:.1} mm; {kept} of {of} \
-         reversals kept",
-        1000.0 * goal.radius
-    )
+impl Toolbox for Run {
+    fn critic(&self, round: &Round<'_>) -> Result<(Critic, CriticReport)> {
+        let (c, iteration) = (self.config(), round.iteration);
+        let network = &c.critic.network;
+        let bar = self.progress.bar(&format!("critic {iteration}"), network.steps as u64);
+        let trained = train_critic(
+            &c.policy,
+            network,
+            &self.compute,
+            &round.demonstrations.normaliser,
+            &round.policy.weights()?,
+            &round.rollouts.hard,
+            c.env.horizon_hard,
+            self.options.seed,
+            &format!("critic/{iteration}"),
+            |step, loss| {
+                bar.set(step as u64, &format!("loss {loss:.4}"));
+                if self.progress.check().is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            },
+        );
+        let (critic, report) = match trained {
+            Err(e2h_policy::Error::Stopped { .. }) => {
+                return Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }));
+            }
+            done => done?,
+        };
+        let held_out = report.validation_loss.unwrap_or(f64::NAN);
+        bar.finish(&format!("loss {:.4}, held out {held_out:.4}", report.train_loss));
+        if let Some(mut events) = self.events(&format!("critic_{iteration:02}"), 0)? {
+            for (step, &loss) in report.losses.iter().enumerate() {
+                events.scalar("critic/loss", step as u64 + 1, now(), loss.into())?;
+            }
+            events.finish()?;
+        }
+        Ok((critic, report))
+    }
+
+    fn demonstrate(&self, direction: Direction) -> Result<Vec<Episode>> {
+        let c = self.config();
+        let (place, purpose) = match direction {
+            Direction::Easy => ("demonstrations", "demonstrate"),
+            Direction::Hard => ("demonstrations_hard", "demonstrate/hard"),
+        };
+        self.stage(place, || {
+            let wanted = c.closed_loop.demonstrations;
+            let bar = self.progress.bar(&format!("{direction} demonstrations"), wanted as u64);
+            let mut env = self.env.clone_shared()?;
+            let mut episodes = Vec::with_capacity(wanted);
+            let mut failed = 0;
+            let mut index = 0;
+            while episodes.len() < wanted {
+                self.progress.check()?;
+                let origin = Origin::demonstration(&self.options.task, direction, index, self.options.seed);
+                let mut rng = stream(self.options.seed, purpose, 0, u64::from(index));
+                let episode = match demonstrate(&mut env, direction, &c.task.demonstrator, origin, &mut rng) {
+                    Err(e2h_env::Error::Diverged(_)) => None,
+                    recorded => Some(recorded?).filter(|e| e.outcome.is_success()),
+                };
+                index += 1;
+                if let Some(episode) = episode {
+                    episodes.push(episode);
+                } else {
+                    failed += 1;
+                    if failed > wanted {
+                        return Err(Error::Demonstrations(format!(
+                            "the scripted demonstrator failed {failed} times for {} successes",
+                            episodes.len()
+                        )));
+                    }
+                }
+                bar.set(episodes.len() as u64, &format!("{failed} failed"));
+            }
+            bar.finish(&format!("{wanted} recorded, {failed} failed"));
+            Ok(episodes)
+        })
+    }
 }
 
 /// More threads than that no machine has cores for.

@@ -3,13 +3,14 @@
 
 use e2h_core::{Direction, Episode, Image, Kind, Observation, Origin, Outcome, stream};
 use e2h_env::{Env, demonstrate, task};
-use e2h_learn::{Accepted, Base, Collected, Run, RunConfig, RunOptions};
+use e2h_learn::methods::AutoE2h;
+use e2h_learn::record::Collection;
+use e2h_learn::{Accepted, Collected, Demonstrations, Method as _, Run, RunConfig, RunOptions, Trained};
 use e2h_policy::DiffusionPolicy;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
 use toml::{Table, Value};
 
 const PRESETS: [&str; 3] = ["smoke", "laptop", "paper"];
@@ -256,7 +257,6 @@ const CHANGES: &[Change] = &[
     ("refine.reverse.open_width_m", Ok((Refine, "0.2"))),
     ("refine.reverse.open_at", Ok((Refine, "0.999"))),
     ("refine.reverse.close_at", Ok((Refine, "0.05"))),
-    ("refine.reverse.reference_quaternion", Ok((Refine, "[0.0,-1.0,0.0,0.0]"))),
     ("refine.reverse.labels", Ok((Refine, "travelled"))),
     ("refine.reverse.labels_fade", Ok((Refine, "30"))),
     ("refine.kinematic.static_speed", Ok((Refine, "0.01"))),
@@ -278,14 +278,11 @@ const CHANGES: &[Change] = &[
     ("refine.goal.percentile", Ok((Refine, "100.0"))),
     ("refine.goal.least", Ok((Refine, "0.05"))),
     ("refine.gate.enabled", Ok((Refine, "false"))),
-    ("refine.gate.closings", Ok((Refine, "2"))),
-    ("refine.gate.openings", Ok((Refine, "2"))),
     ("refine.advantage.gamma", Ok((Refine, "0.9"))),
     ("refine.advantage.lambda", Ok((Refine, "0.5"))),
     ("refine.advantage.smooth", Ok((Refine, "5"))),
     ("refine.advantage.percentile", Ok((Refine, "60.0"))),
     ("refine.advantage.min_run", Ok((Refine, "5"))),
-    ("refine.advantage.horizon", Ok((Refine, "60"))),
     ("refine.suffix.enabled", Ok((Refine, "false"))),
     ("refine.suffix.value", Ok((Refine, "1.0"))),
     ("refine.suffix.frames", Ok((Refine, "12"))),
@@ -318,17 +315,12 @@ fn open(out: &Path, change: &str) -> Run {
     // The last word wins.
     let set = BASE.iter().copied().chain(change.split(' ').filter(|c| !c.is_empty()));
     let options = RunOptions {
-        task: TASK.to_owned(),
         preset: "smoke".to_owned(),
         seed: 5,
         set: set.map(str::to_owned).collect(),
         out: Some(out.to_owned()),
-        resume: false,
-        device: "cpu".to_owned(),
-        threads: None,
         quiet: true,
-        tensorboard: false,
-        stop: e2h_learn::Stop::default(),
+        ..RunOptions::new(TASK)
     };
     Run::open(&options).unwrap()
 }
@@ -354,12 +346,25 @@ fn print(value: &impl std::fmt::Debug) -> u64 {
 /// What the stages after the demonstrations are given, made once.
 struct Given {
     demonstrations: std::path::PathBuf,
-    hard: DiffusionPolicy,
-    easy: DiffusionPolicy,
+    hard: std::path::PathBuf,
+    easy: std::path::PathBuf,
     collected: Vec<Episode>,
 }
 
 impl Given {
+    fn policy(&self, folder: &Path) -> DiffusionPolicy {
+        DiffusionPolicy::load(folder).unwrap().0
+    }
+
+    fn accepted(&self) -> Accepted {
+        Accepted {
+            segments: self.collected.iter().cloned().map(Arc::new).collect(),
+            easy: vec![],
+            collection: Collection::default(),
+            stage_minutes: BTreeMap::new(),
+        }
+    }
+
     /// Scripted episodes in place of rollouts, one of each kind cut short.
     fn collected(&self) -> Collected {
         let (easy, hard): (Vec<_>, Vec<_>) =
@@ -398,7 +403,7 @@ fn record(run: &Run) -> Vec<Episode> {
 }
 
 /// What the policy does where the first demonstration begins.
-fn act(run: &Run, policy: &DiffusionPolicy, base: &Base) -> u64 {
+fn act(run: &Run, policy: &dyn Trained, base: &Demonstrations) -> u64 {
     let c = &run.config().policy;
     let episode = &base.easy[0];
     let image = |name: &String| {
@@ -407,7 +412,7 @@ fn act(run: &Run, policy: &DiffusionPolicy, base: &Base) -> u64 {
     };
     let observation = Observation { state: episode.state[0], frames: c.cameras.iter().map(image).collect() };
     let history = vec![&observation; c.n_obs_steps];
-    print(&policy.sample(&[history], &mut [stream(1, "act", 0, 0)]).unwrap())
+    print(&policy.act(&[history], &mut [stream(1, "act", 0, 0)]).unwrap())
 }
 
 fn observe(stage: Stage, change: &str, given: Option<&Given>) -> String {
@@ -429,7 +434,7 @@ fn observe(stage: Stage, change: &str, given: Option<&Given>) -> String {
             "{} {} {} {}",
             print(&base.easy),
             print(&base.easy_training),
-            print(&base.hard_training),
+            print(&base.hard),
             print(&base.normaliser)
         );
     };
@@ -437,27 +442,33 @@ fn observe(stage: Stage, change: &str, given: Option<&Given>) -> String {
         Train => {
             let (hard, easy) = (run.train_initial(&base).unwrap(), run.train_easy(&base).unwrap());
             let weights = [&hard, &easy].map(|p| print(&p.weights().unwrap()));
-            format!("{weights:?} {}", act(&run, &hard, &base))
+            format!("{weights:?} {}", act(&run, &*hard, &base))
         }
         Update => {
-            let accepted: Vec<Arc<Episode>> = given.collected.iter().cloned().map(Arc::new).collect();
-            print(&run.update(1, &given.hard, &base, &accepted).unwrap().weights().unwrap()).to_string()
+            let hard = given.policy(&given.hard);
+            print(&run.update(1, &hard, &base, &[given.accepted()]).unwrap().weights().unwrap()).to_string()
         }
-        Collect => print(&run.collect(1, &given.hard, &given.easy).unwrap()).to_string(),
+        Collect => {
+            let (hard, easy) = (given.policy(&given.hard), given.policy(&given.easy));
+            print(&run.collect(1, &hard, &easy).unwrap()).to_string()
+        }
+        Accumulate => {
+            let rounds = [given.accepted(), given.accepted()];
+            let segments = rounds.each_ref().map(|r| &r.segments[..]);
+            let sources = AutoE2h.sources(&base, &segments, run.config());
+            sources.iter().map(|s| s.episodes.len()).sum::<usize>().to_string()
+        }
         Evaluate => {
             std::fs::create_dir_all(out.join("iteration_00")).unwrap();
-            let record = run.evaluate(0, &given.hard, None).unwrap();
+            let record = run.evaluate(0, &given.policy(&given.hard), None).unwrap();
             let film = std::fs::read(out.join("iteration_00/rollouts.png")).ok();
             format!("{} {}", record.evaluation.trials, print(&film))
         }
         _ => {
             // Ends of demonstrations that differ, for the gate of the goal.
-            base.hard_training.extend(given.collected.iter().skip(3).cloned().map(Arc::new));
-            let accepted: Accepted =
-                run.refine(1, given.collected(), Duration::ZERO, &base, &given.hard).unwrap();
-            if stage == Accumulate {
-                return run.training_set(2, &accepted).unwrap().len().to_string();
-            }
+            base.hard.extend(given.collected.iter().skip(3).cloned().map(Arc::new));
+            let hard = given.policy(&given.hard);
+            let accepted = run.lesson(1, &base, &hard, || Ok(given.collected())).unwrap();
             let picture = std::fs::read(out.join("iteration_01/filter.svg")).ok();
             let easy = out.join("iteration_01/easy_segments").exists();
             format!(
@@ -480,10 +491,12 @@ fn another_value_of_every_key_makes_another_run() {
     let dir = tempfile::tempdir().unwrap();
     let run = open(&dir.path().join("run"), "");
     let base = run.demonstrations().unwrap();
+    run.train_initial(&base).unwrap();
+    run.train_easy(&base).unwrap();
     let given = Given {
         demonstrations: dir.path().join("run/demonstrations"),
-        hard: run.train_initial(&base).unwrap(),
-        easy: run.train_easy(&base).unwrap(),
+        hard: dir.path().join("run/iteration_00/policy"),
+        easy: dir.path().join("run/policy_easy"),
         collected: record(&run),
     };
     let stages = [Demonstrate, Train, Update, Collect, Refine, Accumulate, Evaluate, Length];

@@ -13,6 +13,8 @@ use std::path::Path;
 /// Version of the checkpoint folder's layout; a reader refuses others.
 pub const CHECKPOINT_FORMAT: u32 = 1;
 
+/// The class of policies that these checkpoints are of.
+const KIND: &str = "diffusion";
 const CONFIG_FILE: &str = "policy.json";
 const WEIGHTS_FILE: &str = "model.safetensors";
 
@@ -50,12 +52,19 @@ pub struct Checkpoint {
 #[serde(deny_unknown_fields)]
 struct File {
     format: u32,
+    /// Class of the policy; none in files of version 0.1.
+    #[serde(default = "kind")]
+    kind: String,
     state_dim: usize,
     action_dim: usize,
     weights_sha256: String,
     config: PolicyConfig,
     normaliser: Normaliser,
     provenance: Provenance,
+}
+
+fn kind() -> String {
+    KIND.to_owned()
 }
 
 impl Checkpoint {
@@ -86,6 +95,7 @@ impl Checkpoint {
         let bytes = std::fs::read(&weights_path).map_err(io("reading back", &weights_path))?;
         let file = File {
             format: CHECKPOINT_FORMAT,
+            kind: kind(),
             state_dim: STATE_DIM,
             action_dim: ACTION_DIM,
             weights_sha256: hex(&bytes),
@@ -111,6 +121,11 @@ impl Checkpoint {
         // The version is looked at alone first: a newer file may have fields that this reader does not know.
         let value: serde_json::Value =
             serde_json::from_str(&text).map_err(|e| fail(format!("expected JSON, found {e}")))?;
+        let found = value.get("kind").and_then(serde_json::Value::as_str).unwrap_or(KIND);
+        if found != KIND {
+            let found = e2h_core::one_line(found);
+            return Err(fail(format!("expected a policy of kind `{KIND}`, found `{found}`")));
+        }
         let format = value.get("format").and_then(serde_json::Value::as_u64);
         if format != Some(u64::from(CHECKPOINT_FORMAT)) {
             let found = format.map_or("none".to_owned(), |f| f.to_string());

@@ -4,7 +4,7 @@ use crate::batch::{Host, Rows};
 use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Episode, Rng, stream};
-use e2h_data::{Alignment, Normaliser, Sampler, Set, Window, WindowConfig, Windows};
+use e2h_data::{Alignment, Normaliser, Sampler, Source, Window, WindowConfig, Windows};
 use e2h_nn::{
     Adam, Compute, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows,
 };
@@ -14,36 +14,29 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::Arc;
 
-/// What a policy learns from: windows of two sets of episodes, and how they are scaled.
+/// What a policy learns from: windows of weighted sources, and how they are scaled.
 pub struct TrainingData<'a> {
-    base: (&'a [Arc<Episode>], Windows),
-    accepted: (&'a [Arc<Episode>], Windows),
+    sources: Vec<(&'a [Arc<Episode>], Windows)>,
     sampler: Sampler,
     normaliser: &'a Normaliser,
 }
 
 impl<'a> TrainingData<'a> {
-    /// Windows over `base` (the initial demonstrations) and `accepted` (what refinement kept), of which every batch takes
-    /// `base_share` from the first.
+    /// Windows over `sources`, of which every batch takes as much as their shares say.
     ///
     /// # Errors
-    /// When both are empty.
-    pub fn new(
-        base: &'a [Arc<Episode>],
-        accepted: &'a [Arc<Episode>],
-        base_share: f32,
-        config: &PolicyConfig,
-        normaliser: &'a Normaliser,
-    ) -> Result<Self> {
+    /// When there is nothing to draw from.
+    pub fn new(sources: &'a [Source], config: &PolicyConfig, normaliser: &'a Normaliser) -> Result<Self> {
         let window = WindowConfig {
             n_obs_steps: config.n_obs_steps,
             horizon: config.horizon,
             alignment: if config.lerobot_alignment { Alignment::LeRobot } else { Alignment::Paper },
         };
-        let base = (base, Windows::new(base, &window));
-        let accepted = (accepted, Windows::new(accepted, &window));
-        let sampler = Sampler::new(&base.1, &accepted.1, f64::from(base_share))?;
-        Ok(Self { base, accepted, sampler, normaliser })
+        let windows: Vec<_> =
+            sources.iter().map(|s| (&s.episodes[..], Windows::new(&s.episodes, &window))).collect();
+        let shares: Vec<_> = windows.iter().zip(sources).map(|((_, w), s)| (w, f64::from(s.share))).collect();
+        let sampler = Sampler::new(&shares)?;
+        Ok(Self { sources: windows, sampler, normaliser })
     }
 
     fn batch(&self, size: usize, rng: &mut Rng) -> Vec<(&Episode, Window)> {
@@ -51,10 +44,7 @@ impl<'a> TrainingData<'a> {
         picks
             .into_iter()
             .map(|pick| {
-                let (episodes, windows) = match pick.set {
-                    Set::First => &self.base,
-                    Set::Second => &self.accepted,
-                };
+                let (episodes, windows) = &self.sources[pick.source];
                 let window = windows.window(pick.window);
                 (&*episodes[window.episode], window)
             })

@@ -88,7 +88,8 @@ fn training_and_sampling_are_the_same() {
     let normaliser = Normaliser::fit(&[episode(40, true)], &NormaliserConfig::default()).unwrap();
     for (prediction, guidance) in [(Prediction::Sample, 1.0), (Prediction::Epsilon, 1.5)] {
         let config = PolicyConfig { prediction, guidance, relative_features: true, ..PolicyConfig::tiny() };
-        let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
+        let sources = [e2h_data::Source::whole(episodes.to_vec())];
+        let data = TrainingData::new(&sources, &config, &normaliser).unwrap();
         let run = || {
             // What `on` is for on a GPU machine: made on the CPU, moved.
             let trainer = Trainer::new(&config, &train_config(), 8, None, 1, "candle").unwrap();
@@ -133,7 +134,8 @@ fn a_training_moves() {
     let episodes = [Arc::new(episode(40, true))];
     let normaliser = Normaliser::fit(&[episode(40, true)], &NormaliserConfig::default()).unwrap();
     let config = PolicyConfig::tiny();
-    let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
+    let sources = [e2h_data::Source::whole(episodes.to_vec())];
+    let data = TrainingData::new(&sources, &config, &normaliser).unwrap();
     let new = || Trainer::new(&config, &train_config(), 8, None, 1, "move").unwrap();
     let (mut stays, mut moves) = (new(), new());
     for _ in 0..3 {

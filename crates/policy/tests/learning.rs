@@ -54,7 +54,8 @@ fn one_trajectory_is_overfitted_and_the_sampled_actions_are_its_own() {
     let config = PolicyConfig::tiny();
     let normaliser =
         Normaliser::fit(&episodes.each_ref().map(|e| &**e), &NormaliserConfig::default()).unwrap();
-    let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
+    let sources = [e2h_data::Source::whole(episodes.to_vec())];
+    let data = TrainingData::new(&sources, &config, &normaliser).unwrap();
     let mut trainer = Trainer::new(&config, &train_config(), 400, None, 1, "overfit").unwrap();
     let losses: Vec<f32> = (0..400).map(|_| trainer.step(&data).unwrap()).collect();
     let last = losses[380..].iter().sum::<f32>() / 20.0;
@@ -174,7 +175,8 @@ fn training_goes_on_from_a_saved_state_with_the_same_bytes() {
     let episodes = [Arc::new(episode(40, true))];
     let config = PolicyConfig::tiny();
     let normaliser = Normaliser::fit(&[episode(40, true)], &NormaliserConfig::default()).unwrap();
-    let data = TrainingData::new(&episodes, &[], 0.5, &config, &normaliser).unwrap();
+    let sources = [e2h_data::Source::whole(episodes.to_vec())];
+    let data = TrainingData::new(&sources, &config, &normaliser).unwrap();
     let new = || Trainer::new(&config, &train_config(), 8, None, 1, "resume").unwrap();
     let (mut whole, mut first, mut second) = (new(), new(), new());
     for _ in 0..8 {

@@ -2,7 +2,7 @@
 
 use super::RunConfig;
 use crate::{Error, Result};
-use e2h_env::{CAMERAS, DemonstratorConfig, TaskOptions};
+use e2h_env::CAMERAS;
 
 /// Most weights of a policy: with its optimiser and its average 16 GB.
 const MOST_PARAMETERS: u128 = 1_000_000_000;
@@ -47,7 +47,11 @@ impl RunConfig {
     /// Lists all problems, each with its key, what was expected and what was found.
     pub fn validate(&self) -> Result<()> {
         let mut all = Problems::default();
-        self.check_task(&mut all);
+        all.of("task.demonstrator", self.task.demonstrator.validate());
+        let clearance = self.task.clearance;
+        all.check((0.0..=1.0).contains(&clearance), || {
+            format!("task.clearance: expected 0 to 1, got {clearance}")
+        });
         self.check_loop(&mut all);
         self.check_learning(&mut all);
         let r = &self.refine;
@@ -65,16 +69,12 @@ impl RunConfig {
         if all.0.is_empty() { Ok(()) } else { Err(Error::Config(all.0.join("; "))) }
     }
 
-    fn check_task(&self, all: &mut Problems) {
-        all.of("task.demonstrator", self.task.demonstrator.validate());
-        // Its settings are told above, with their keys.
-        let options = TaskOptions { demonstrator: DemonstratorConfig::default(), ..self.task.options() };
-        if let Err(e) = e2h_env::task(&self.task.name, &options) {
-            all.0.push(format!(
-                "task.name, task.variant or task.clearance: {}",
-                e2h_core::one_line(&e.to_string())
-            ));
-        }
+    /// Whether the registry has the task in that form.
+    pub(super) fn check_registry(&self) -> Result<()> {
+        e2h_env::task(&self.task.name, &self.task.options()).map(|_| ()).map_err(|e| {
+            let problem = e2h_core::one_line(&e.to_string());
+            Error::Config(format!("task.name, task.variant or task.clearance: {problem}"))
+        })
     }
 
     fn check_loop(&self, all: &mut Problems) {

@@ -56,6 +56,7 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
         task: "nut_assembly".to_owned(),
         variant: "loose".to_owned(),
         preset: "laptop".to_owned(),
+        method: "auto-e2h".to_owned(),
         seed,
         version: "0.1.0".to_owned(),
         demonstrations: 10,

@@ -1,6 +1,7 @@
 //! What a run says of itself: one row of the record an iteration, and the report at the end.
 
-use super::{Accepted, AcceptedNotes, Base, Run, TrainNotes, folder, now};
+use super::stage::TrainNotes;
+use super::{Accepted, Demonstrations, Run, folder, now};
 use crate::Result;
 use crate::evaluate::{Filmed, Filming, evaluate};
 use crate::picture;
@@ -8,8 +9,7 @@ use crate::record::{IterationRecord, RunResults};
 use crate::report;
 use crate::rollout;
 use crate::view::scalars;
-use e2h_core::{Direction, Episode};
-use e2h_policy::DiffusionPolicy;
+use e2h_core::{Direction, Episode, Policy};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -32,7 +32,7 @@ impl Run {
     pub fn evaluate(
         &self,
         iteration: u32,
-        policy: &DiffusionPolicy,
+        policy: &dyn Policy,
         accepted: Option<&Accepted>,
     ) -> Result<IterationRecord> {
         let file = folder(iteration, "record.json");
@@ -62,10 +62,9 @@ impl Run {
             let recorded: Option<BTreeMap<String, f64>> = self.dir.get("demonstrations/notes.json")?;
             let recorded = recorded.and_then(|r| r.get("minutes").copied()).unwrap_or(0.0);
             stage_minutes.insert("demonstrations".to_owned(), recorded);
-        } else if let Some(notes) =
-            self.dir.get::<AcceptedNotes>(&folder(iteration, "segments/notes.json"))?
-        {
-            stage_minutes.extend(notes.stage_minutes);
+        }
+        if let Some(accepted) = accepted {
+            stage_minutes.extend(accepted.stage_minutes.clone());
         }
         let before = if iteration == 0 {
             0.0
@@ -106,13 +105,19 @@ impl Run {
     ///
     /// # Errors
     /// When the folder cannot be written.
-    pub fn report(&self, base: &Base, records: Vec<IterationRecord>) -> Result<(RunResults, PathBuf)> {
+    pub fn report(
+        &self,
+        demonstrations: &Demonstrations,
+        records: Vec<IterationRecord>,
+    ) -> Result<(RunResults, PathBuf)> {
         let c = self.config();
-        let steps: usize = base.easy.iter().map(Episode::len).sum();
+        let easy = &demonstrations.easy;
+        let steps: usize = easy.iter().map(Episode::len).sum();
         let results = RunResults {
             task: self.options.task.clone(),
             variant: c.task.variant.clone(),
             preset: self.options.preset.clone(),
+            method: self.options.method.clone(),
             seed: self.options.seed,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             demonstrations: c.closed_loop.demonstrations,
@@ -120,7 +125,7 @@ impl Run {
             overrides: self.options.set.clone(),
             machine: machine(self.compute.name()),
             iterations: records,
-            demonstration_steps: steps as f64 / base.easy.len().max(1) as f64,
+            demonstration_steps: steps as f64 / easy.len().max(1) as f64,
         };
         self.dir.put("results.json", &results)?;
         let mut pictures = report::Pictures::default();

@@ -126,6 +126,7 @@ impl RunSource {
             task: self.identity.task.clone(),
             variant: self.config.as_ref().map_or(String::new(), |c| c.task.variant.clone()),
             preset: self.identity.preset.clone(),
+            method: self.identity.method.clone(),
             seed: self.identity.seed,
             version: String::new(),
             demonstrations: self.config.as_ref().map_or(0, |c| c.closed_loop.demonstrations),

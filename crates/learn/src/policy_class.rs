@@ -1,0 +1,166 @@
+//! What the loop needs of a policy: to train on weighted sources, to act, to be saved and read again.
+//!
+//! [`Diffusion`] is the built-in class. A class of one's own goes into [`Parts`](crate::Parts);
+//! `examples/own_policy.rs` has one.
+
+use crate::{Error, Result, RunConfig};
+use e2h_core::Policy;
+use e2h_data::{Normaliser, Source};
+use e2h_nn::{Compute, Weights};
+use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData};
+use std::path::Path;
+
+/// A policy that a run has trained.
+pub trait Trained: Policy {
+    /// Its weights by name: an update goes on from them, and the critic's image encoders start from those of the same name and
+    /// shape.
+    ///
+    /// # Errors
+    /// When they cannot be read back from the device.
+    fn weights(&self) -> Result<Weights>;
+
+    /// Writes a folder that stands alone, with a file `policy.json` that names its class as `kind`.
+    ///
+    /// # Errors
+    /// When a weight is not finite or the folder cannot be written.
+    fn save(&self, folder: &Path, provenance: &Provenance) -> Result<()>;
+}
+
+/// A stage of training to begin.
+pub struct Job<'a> {
+    /// The run's configuration.
+    pub config: &'a RunConfig,
+    /// What is learned from.
+    pub sources: &'a [Source],
+    /// Scaling of states and actions.
+    pub normaliser: &'a Normaliser,
+    /// Steps of the stage: the length of the learning-rate schedule.
+    pub steps: usize,
+    /// Weights to go on from; none: fresh ones.
+    pub start: Option<&'a Weights>,
+    /// The run's seed.
+    pub seed: u64,
+    /// Names the random streams of the stage, so that no two share one.
+    pub purpose: &'a str,
+    /// Where networks are computed.
+    pub compute: &'a Compute,
+}
+
+/// A training in progress, one step at a time.
+pub trait Training {
+    /// Steps done.
+    fn step_count(&self) -> usize;
+
+    /// One step; returns its loss. Draws from a stream named by the step, so that a stage goes on after
+    /// [`Training::restore`] as if nothing had happened.
+    ///
+    /// # Errors
+    /// When the data do not fit, or the loss is not finite.
+    fn step(&mut self) -> Result<f32>;
+
+    /// Mean loss of the last steps.
+    fn mean_loss(&self) -> f64;
+
+    /// Writes all that [`Training::restore`] needs.
+    ///
+    /// # Errors
+    /// When the file cannot be written, or a number is not finite: the file that was there stays.
+    fn save(&self, file: &Path) -> Result<()>;
+
+    /// Goes on from a file of [`Training::save`].
+    ///
+    /// # Errors
+    /// When the file is missing, damaged or of another network.
+    fn restore(&mut self, file: &Path) -> Result<()>;
+
+    /// The policy to act with.
+    ///
+    /// # Errors
+    /// When a weight is not finite.
+    fn policy(&self) -> Result<Box<dyn Trained>>;
+}
+
+/// A kind of policy that a run can train.
+pub trait PolicyClass: Send + Sync {
+    /// Its name, for example `diffusion`.
+    fn name(&self) -> &str;
+
+    /// Begins a stage.
+    ///
+    /// # Errors
+    /// When the configuration, the data or the weights to start from do not fit.
+    fn train<'a>(&self, job: Job<'a>) -> Result<Box<dyn Training + 'a>>;
+
+    /// Reads a folder that [`Trained::save`] wrote.
+    ///
+    /// # Errors
+    /// When a file is missing, foreign or damaged; names what was expected and found.
+    fn load(&self, folder: &Path, compute: &Compute) -> Result<Box<dyn Trained>>;
+}
+
+/// The image-conditioned diffusion policy.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Diffusion;
+
+impl Trained for DiffusionPolicy {
+    fn weights(&self) -> Result<Weights> {
+        Ok(DiffusionPolicy::weights(self)?)
+    }
+
+    fn save(&self, folder: &Path, provenance: &Provenance) -> Result<()> {
+        Ok(DiffusionPolicy::save(self, folder, provenance)?)
+    }
+}
+
+struct DiffusionTraining<'a> {
+    trainer: Trainer,
+    data: TrainingData<'a>,
+    job: Job<'a>,
+}
+
+impl Training for DiffusionTraining<'_> {
+    fn step_count(&self) -> usize {
+        self.trainer.step_count()
+    }
+
+    fn step(&mut self) -> Result<f32> {
+        Ok(self.trainer.step(&self.data)?)
+    }
+
+    fn mean_loss(&self) -> f64 {
+        self.trainer.mean_loss()
+    }
+
+    fn save(&self, file: &Path) -> Result<()> {
+        Ok(self.trainer.save(file)?)
+    }
+
+    fn restore(&mut self, file: &Path) -> Result<()> {
+        Ok(self.trainer.restore(file)?)
+    }
+
+    fn policy(&self) -> Result<Box<dyn Trained>> {
+        let (config, weights) = (&self.job.config.policy, self.trainer.weights()?);
+        let policy = DiffusionPolicy::with_weights(config, self.job.normaliser, &weights)?;
+        Ok(Box::new(policy.on(self.job.compute)?))
+    }
+}
+
+impl PolicyClass for Diffusion {
+    fn name(&self) -> &str {
+        "diffusion"
+    }
+
+    fn train<'a>(&self, job: Job<'a>) -> Result<Box<dyn Training + 'a>> {
+        let (policy, step) = (&job.config.policy, &job.config.train.step);
+        let data = TrainingData::new(job.sources, policy, job.normaliser)?;
+        let trainer =
+            Trainer::new(policy, step, job.steps, job.start, job.seed, job.purpose)?.on(job.compute)?;
+        Ok(Box::new(DiffusionTraining { trainer, data, job }))
+    }
+
+    fn load(&self, folder: &Path, compute: &Compute) -> Result<Box<dyn Trained>> {
+        let (policy, _) = DiffusionPolicy::load(folder).map_err(Error::from)?;
+        Ok(Box::new(policy.on(compute)?))
+    }
+}

@@ -113,7 +113,7 @@ fn a_published_checkpoint_with_a_damaged_run_section_is_refused_by_name() {
     assert_success(&evaluate(&|_| ()).output().unwrap());
     let gone = |run: &mut serde_json::Value| drop(run["loop"].as_object_mut().unwrap().remove("cycles"));
     fails(&mut evaluate(&gone), &[place, "run configuration", "missing field `cycles`"]);
-    let renamed = |run: &mut serde_json::Value| run["env"]["holdsteps"] = run["env"]["hold_steps"].take();
+    let renamed = |run: &mut serde_json::Value| run["env"]["holdsteps"] = 10.into();
     fails(&mut evaluate(&renamed), &[place, "run configuration", "holdsteps"]);
     let text = |run: &mut serde_json::Value| run["loop"]["cycles"] = "4O".into();
     fails(&mut evaluate(&text), &[place, "run configuration", "4O"]);

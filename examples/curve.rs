@@ -10,8 +10,8 @@
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::{Context as _, bail};
-use auto_e2h::learn::record::RunResults;
-use auto_e2h::learn::report::{self, curve};
+use auto_e2h::report::record::RunResults;
+use auto_e2h::report::{self, curve};
 use clap::Parser;
 use std::path::{Path, PathBuf};
 

@@ -8,7 +8,7 @@
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use auto_e2h::data::lerobot::ColumnSlice;
-use auto_e2h::learn::view::{Options, VIEW_FILE, write, write_scalars};
+use auto_e2h::report::view::{Options, VIEW_FILE, write, write_scalars};
 use clap::Parser;
 use std::path::PathBuf;
 use std::time::UNIX_EPOCH;

@@ -3,9 +3,9 @@
 use super::recording::Recording;
 use super::{Options, Source};
 use crate::Result;
-use crate::report::animation::{apng_bytes, hstack};
-use crate::report::png_bytes;
-use crate::report::png_image::data_uri;
+use crate::animation::{apng_bytes, hstack};
+use crate::png_bytes;
+use crate::png_image::data_uri;
 use e2h_core::Image;
 
 /// Tallest picture in an animation, pixels; taller ones are made smaller.

@@ -2,12 +2,12 @@
 
 use super::entry::Entries;
 use super::plot;
-use crate::report::fate;
-use crate::report::png_image::base64;
-use crate::report::svg::{escape, percent};
+use crate::fate;
+use crate::png_image::base64;
+use crate::svg::{escape, percent};
 use sha2::{Digest as _, Sha256};
 
-const STYLE: &str = include_str!("../report/page.css");
+const STYLE: &str = include_str!("../page.css");
 const VIEW_STYLE: &str = include_str!("view.css");
 const SCRIPT: &str = include_str!("view.js");
 

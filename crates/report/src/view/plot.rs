@@ -1,7 +1,7 @@
 //! Small plots that fit any width: a stretched drawing with its labels beside it in HTML, and the band of fates.
 
-use crate::report::fate;
-use crate::report::svg::{colour, escape, number};
+use crate::fate;
+use crate::svg::{colour, escape, number};
 
 /// Sides of a drawing, in its own units; whole numbers are fine enough and short.
 const WIDTH: f64 = 1000.0;

@@ -1,7 +1,7 @@
 //! What refinement did to one reversed rollout: its images, scores, thresholds and the fate of every frame.
 
-use super::svg::{Axes, document, legend, number, percent, px, ticks};
-use super::{Result, animation, fate, png_image};
+use crate::svg::{Axes, document, legend, number, percent, px, ticks};
+use crate::{Result, animation, fate, png_image};
 use e2h_core::Image;
 use std::collections::BTreeMap;
 
@@ -245,8 +245,8 @@ fn threshold_lines(axes: &Axes, thresholds: &[Threshold]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample;
     use super::*;
+    use crate::sample;
 
     #[test]
     fn every_frame_is_in_a_band_and_in_the_totals() {

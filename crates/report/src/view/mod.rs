@@ -12,7 +12,7 @@ mod panel;
 mod plot;
 mod recording;
 mod run;
-pub(crate) mod scalars;
+pub mod scalars;
 
 use crate::{Error, Result};
 use e2h_data::lerobot::ColumnSlice;
@@ -116,12 +116,12 @@ impl Source {
 pub fn write(dir: &Path, out: &Path, options: &Options) -> Result<Written> {
     let (html, mut written) = html(dir, options)?;
     out.clone_into(&mut written.path);
-    crate::directory::write_atomic(out, html.as_bytes())?;
+    e2h_data::write_atomic(out, html.as_bytes())?;
     Ok(written)
 }
 
 fn html(dir: &Path, options: &Options) -> Result<(String, Written)> {
-    let problem = |text: String| Err(Error::Config(text));
+    let problem = |text: String| Err(Error::Options(text));
     if options.episodes == 0 || options.stride == Some(0) {
         return problem("episodes and stride: expected at least 1, got 0".to_owned());
     }

@@ -1,7 +1,7 @@
 //! The success curve as plain text.
 
-use super::svg::percent;
 use crate::record::{IterationRecord, RunResults};
+use crate::svg::percent;
 
 /// Text table for a terminal: iteration, success k/n, Wilson 95 %, minutes, external resets, frames kept. Ends with a
 /// line break.
@@ -40,13 +40,13 @@ fn row(r: &IterationRecord) -> [String; 6] {
 }
 
 /// `21% to 45%`.
-pub(super) fn interval([lo, hi]: [f64; 2]) -> String {
+pub(crate) fn interval([lo, hi]: [f64; 2]) -> String {
     format!("{} to {}", percent(lo), percent(hi))
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample;
+    use crate::sample;
 
     #[test]
     fn columns_line_up() {

@@ -23,7 +23,10 @@ pub(super) fn run(source: &RunSource, out: &Path, wall_time: f64) -> Result<usiz
 }
 
 /// Writes one row of a run's record; the number of values.
-pub(crate) fn iteration(events: &mut Events, record: &IterationRecord, wall_time: f64) -> Result<usize> {
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn iteration(events: &mut Events, record: &IterationRecord, wall_time: f64) -> Result<usize> {
     let e = &record.evaluation;
     let mut values = vec![
         ("eval/success_rate", e.successes as f64 / e.trials.max(1) as f64),

@@ -1,13 +1,16 @@
 //! From episodes and rollouts to what the report draws.
 
 use crate::Result;
-use crate::report::animation::{sampled_frames, tile};
-use crate::report::filter::FilterPicture;
+use crate::animation::{sampled_frames, tile};
+use crate::filter::FilterPicture;
 use e2h_core::{CONTROL_HZ, Episode, Image, Outcome};
-use e2h_refine::{Fate, KinematicConfig, Refined};
+use e2h_refine::{KinematicConfig, Refined};
 
 /// The filter picture of one reversed rollout: sampled frames, speed, value, and what became of every frame.
-pub(crate) fn filter(episode: &Episode, refined: &Refined, config: &KinematicConfig) -> Result<String> {
+///
+/// # Errors
+/// When an image's bytes do not fill it.
+pub fn filter(episode: &Episode, refined: &Refined, config: &KinematicConfig) -> Result<String> {
     let picture = FilterPicture {
         times: (0..episode.len()).map(|t| t as f32 / CONTROL_HZ as f32).collect(),
         speed: refined.speed.clone(),
@@ -19,10 +22,10 @@ pub(crate) fn filter(episode: &Episode, refined: &Refined, config: &KinematicCon
         dynamics_threshold: None,
         static_speed: config.static_speed as f32,
         slow_speed: config.slow_speed as f32,
-        fates: refined.fates.iter().map(|&f| fate_name(f).to_owned()).collect(),
+        fates: refined.fates.iter().map(|f| f.name().to_owned()).collect(),
         frames: sampled_frames(episode, 0, 8),
     };
-    Ok(picture.svg()?)
+    picture.svg()
 }
 
 /// How far the goal of every row was displaced, mm; none where nothing displaced any.
@@ -33,20 +36,8 @@ pub(crate) fn excursions(episode: &Episode) -> Option<Vec<f32>> {
 }
 
 /// Films of several rollouts side by side.
-pub(crate) fn tiles(films: &[(Outcome, Vec<Image>)], columns: usize) -> Vec<Image> {
+#[must_use]
+pub fn tiles(films: &[(Outcome, Vec<Image>)], columns: usize) -> Vec<Image> {
     let (outcomes, frames): (Vec<Outcome>, Vec<Vec<Image>>) = films.iter().cloned().unzip();
     tile(&frames, &outcomes, columns)
-}
-
-/// The name under which a fate is counted.
-pub(crate) fn fate_name(fate: Fate) -> &'static str {
-    match fate {
-        Fate::Kept => "kept",
-        Fate::Static => "static",
-        Fate::Resampled => "resampled",
-        Fate::LowAdvantage => "low_advantage",
-        Fate::DynamicsError => "dynamics_error",
-        Fate::TooShort => "too_short",
-        Fate::AfterGoal => "after_goal",
-    }
 }

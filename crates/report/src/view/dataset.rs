@@ -3,7 +3,7 @@
 use super::page::Head;
 use super::recording::{Account, Camera, Pictures, Recording, Series, kind_name, outcome_name, speeds};
 use super::{Listed, Options};
-use crate::directory::io;
+use crate::error::io;
 use crate::{Error, Result};
 use e2h_core::{Kind, Outcome, one_line};
 use e2h_data::lerobot::{Column, ColumnSlice, DEFAULT_FEATURES, Dataset, Feature, SOURCE_EXCURSION, Table};
@@ -281,7 +281,7 @@ fn place(i: usize, shape: &[usize]) -> String {
 fn given(slice: &ColumnSlice, dataset: &Dataset) -> Result<Position> {
     let width = slice.width(dataset.info())?;
     if width != 3 {
-        return Err(Error::Config(format!("position {slice}: expected 3 entries, found {width}")));
+        return Err(Error::Options(format!("position {slice}: expected 3 entries, found {width}")));
     }
     let entries = [slice.start, slice.start + 1, slice.start + 2];
     Ok(Position { column: slice.column.clone(), entries })

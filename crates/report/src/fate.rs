@@ -56,12 +56,12 @@ pub(crate) fn label(rank: usize) -> &'static str {
 }
 
 /// Fill of the fate in a drawing whose patterns are called `prefix`.
-pub(super) fn fill(rank: usize, prefix: &str) -> String {
+pub(crate) fn fill(rank: usize, prefix: &str) -> String {
     format!("url(#{prefix}{rank})")
 }
 
 /// The patterns behind [`fill`]. Every drawing has its own `prefix`: a page may hide one drawing and show another.
-pub(super) fn patterns(prefix: &str) -> String {
+pub(crate) fn patterns(prefix: &str) -> String {
     let mut s = String::from("<defs>");
     for (rank, style) in STYLES.iter().enumerate() {
         let (strength, lines) = match style.fill {
@@ -117,7 +117,7 @@ pub(crate) fn css() -> String {
 }
 
 /// A prefix for [`patterns`] that depends on what is drawn and on nothing else (64-bit FNV-1a).
-pub(super) fn prefix(drawn: impl Iterator<Item = u8>) -> String {
+pub(crate) fn prefix(drawn: impl Iterator<Item = u8>) -> String {
     let hash =
         drawn.fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
     format!("f{hash:016x}-")
@@ -134,7 +134,7 @@ pub(crate) fn totals(fates: &BTreeMap<String, usize>) -> String {
         .into_iter()
         .map(|(rank, name, n)| {
             let name = if rank == RANKS - 1 { name.as_str() } else { label(rank) };
-            format!("{n} {name} ({})", super::svg::percent(n as f64 / sum as f64))
+            format!("{n} {name} ({})", crate::svg::percent(n as f64 / sum as f64))
         })
         .collect();
     if parts.is_empty() { "0 frames".to_owned() } else { format!("{sum} frames: {}", parts.join(", ")) }

@@ -4,10 +4,9 @@
 
 use e2h_core::{Direction, Episode, Frames, Kind, Observation, Origin, Outcome};
 use e2h_data::lerobot::{Column, Dtype, Feature, Table, Writer, features_of};
-use e2h_learn::RunConfig;
-use e2h_learn::record::{Collection, Evaluation, IterationRecord, Reversal, wilson95};
-use e2h_learn::view::{Options, write, write_scalars};
 use e2h_refine::{KinematicConfig, ReverseConfig, kinematic_filter, reverse};
+use e2h_report::record::{Collection, Evaluation, IterationRecord, Reversal, wilson95};
+use e2h_report::view::{Options, write, write_scalars};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -123,10 +122,9 @@ fn episode(index: u32, rows: usize, side: usize) -> Episode {
 /// A run of three demonstrations and one iteration; its segments.
 fn run(dir: &Path) -> Vec<Episode> {
     let put = |name: &str, text: String| std::fs::write(dir.join(name), text).unwrap();
-    let config = RunConfig::resolve("smoke", "nut_assembly", &[]).unwrap();
     std::fs::create_dir_all(dir.join("iteration_01")).unwrap();
     put("run.json", r#"{"format":2,"task":"nut_assembly","preset":"smoke","seed":3}"#.to_owned());
-    put("config.toml", config.text);
+    put("config.toml", include_str!("../../../configs/presets/smoke.toml").to_owned());
     let store = |folder: &str, episodes: &[Episode]| {
         let mut writer =
             Writer::create(dir.join(folder), 20.0, Some("panda"), features_of(&episodes[0])).unwrap();
@@ -337,7 +335,7 @@ fn numbers_of_a_run_and_a_dataset_become_scalars() {
     let dir = tempfile::tempdir().unwrap();
     let read = |folder: &str| {
         let file = std::fs::read_dir(dir.path().join(folder)).unwrap().flatten().next().unwrap().path();
-        e2h_learn::tensorboard::read(&file).unwrap()
+        e2h_report::tensorboard::read(&file).unwrap()
     };
     run(dir.path());
     let count = write_scalars(dir.path(), &dir.path().join("tb"), 1.0e9).unwrap();

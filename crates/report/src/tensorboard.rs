@@ -4,7 +4,7 @@
 //! the bytes are a protobuf `Event`. Only what scalars need is written, by hand.
 //!
 //! ```
-//! use e2h_learn::tensorboard::{Events, read};
+//! use e2h_report::tensorboard::{Events, read};
 //!
 //! let folder = tempfile::tempdir()?;
 //! let mut events = Events::create(folder.path(), 1.7e9, 0)?;
@@ -17,7 +17,7 @@
 //! # Source
 //! `tensorflow/core/util/event.proto`, `summary.proto`, and the record format of `tfrecord` files.
 
-use crate::directory::io;
+use crate::error::io;
 use crate::{Error, Result};
 use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, Write as _};
@@ -74,7 +74,7 @@ impl Events {
                 Err(e) => return Err(io("creating", &path)(e)),
             }
         }
-        Err(Error::Config("no name for an event file is free".to_owned()))
+        Err(Error::Options("no name for an event file is free".to_owned()))
     }
 
     /// Appends one value. It is in the file after [`Events::flush`].

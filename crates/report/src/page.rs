@@ -1,10 +1,10 @@
 //! The report page of one run.
 
-use super::png_image::data_uri;
-use super::svg::{escape, number, percent};
-use super::table::interval;
-use super::{chart, fate};
+use crate::png_image::data_uri;
 use crate::record::{Collection, Evaluation, IterationRecord, RunResults};
+use crate::svg::{escape, number, percent};
+use crate::table::interval;
+use crate::{chart, fate};
 use e2h_core::CONTROL_HZ;
 
 const STYLE: &str = include_str!("page.css");
@@ -250,8 +250,8 @@ fn provenance(results: &RunResults) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{animation, png_bytes, sample};
     use super::*;
+    use crate::{animation, png_bytes, sample};
 
     fn pictures() -> Pictures {
         let rollout = sample::rollout(6, 16, 16, 1);

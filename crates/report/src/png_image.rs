@@ -1,15 +1,15 @@
 //! Still pictures: PNG bytes, and how bytes become part of a page.
 
-use super::{Error, Result};
+use crate::{Error, Result};
 use e2h_core::Image;
 
 /// A width or height as PNG stores it; what does not fit is refused by the encoder.
-pub(super) fn side(pixels: usize) -> u32 {
+pub(crate) fn side(pixels: usize) -> u32 {
     u32::try_from(pixels).unwrap_or(u32::MAX)
 }
 
 /// Refuses an image whose bytes do not fill it.
-pub(super) fn check(image: &Image) -> Result<()> {
+pub(crate) fn check(image: &Image) -> Result<()> {
     let expected = image.height * image.width * 3;
     if image.data.len() == expected {
         return Ok(());

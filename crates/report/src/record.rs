@@ -153,7 +153,7 @@ impl Reversal {
 }
 
 /// `results.json` of a run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct RunResults {
     /// Task pair.
     pub task: String,

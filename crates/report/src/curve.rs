@@ -1,7 +1,7 @@
 //! Success against the number of easy demonstrations, of many runs: does the loop make up for demonstrations?
 
-use super::svg::{Axes, colour, document, legend, percent, ticks};
 use crate::record::{Evaluation, RunResults, wilson95};
+use crate::svg::{Axes, colour, document, legend, percent, ticks};
 use std::collections::{BTreeMap, BTreeSet};
 
 const WIDTH: f64 = 720.0;
@@ -160,8 +160,8 @@ pub fn table(runs: &[&RunResults]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{sample, svg::px};
     use super::*;
+    use crate::{sample, svg::px};
 
     fn run(demonstrations: usize, explored: bool, seed: u64) -> RunResults {
         RunResults { demonstrations, explored, ..sample::results(seed, 3) }

@@ -1,7 +1,7 @@
 //! What all drawings share: theme, colours, numbers, axes, legends.
 
 /// Colours of drawings in both schemes. It is part of every drawing, so that one saved by itself looks the same.
-pub(super) const THEME: &str = "<style>\
+pub(crate) const THEME: &str = "<style>\
 .fig{--ink:#1d2733;--soft:#5b6876;--grid:#dfe4ea;--paper:#fff;display:block;width:100%;height:auto;\
 font:13px system-ui,-apple-system,'Segoe UI',Roboto,sans-serif;font-variant-numeric:tabular-nums}\
 @media(prefers-color-scheme:dark){.fig{--ink:#e4e9ef;--soft:#9aa7b5;--grid:#333d48;--paper:#161b22}}\
@@ -33,7 +33,7 @@ pub(crate) fn escape(text: &str) -> String {
 }
 
 /// A coordinate with one decimal; what is not finite is drawn at 0.
-pub(super) fn px(v: f64) -> String {
+pub(crate) fn px(v: f64) -> String {
     // Adding zero turns a negative zero into a plain one.
     format!("{:.1}", if v.is_finite() { (v * 10.0).round() / 10.0 + 0.0 } else { 0.0 })
 }
@@ -62,7 +62,7 @@ pub(crate) fn percent(share: f64) -> String {
 }
 
 /// Round tick positions, about `count` of them, inside [lo, hi].
-pub(super) fn ticks(lo: f64, hi: f64, count: f64) -> Vec<f64> {
+pub(crate) fn ticks(lo: f64, hi: f64, count: f64) -> Vec<f64> {
     let raw = (hi - lo) / count;
     if !(raw.is_finite() && raw > 0.0) {
         return vec![];
@@ -74,36 +74,36 @@ pub(super) fn ticks(lo: f64, hi: f64, count: f64) -> Vec<f64> {
 }
 
 /// One plotting rectangle and what its sides stand for.
-pub(super) struct Axes {
-    pub(super) left: f64,
-    pub(super) top: f64,
-    pub(super) width: f64,
-    pub(super) height: f64,
+pub(crate) struct Axes {
+    pub(crate) left: f64,
+    pub(crate) top: f64,
+    pub(crate) width: f64,
+    pub(crate) height: f64,
     /// Values at the left and right side.
-    pub(super) x: (f64, f64),
+    pub(crate) x: (f64, f64),
     /// Values at the bottom and the top.
-    pub(super) y: (f64, f64),
+    pub(crate) y: (f64, f64),
 }
 
 impl Axes {
-    pub(super) fn px(&self, x: f64) -> f64 {
+    pub(crate) fn px(&self, x: f64) -> f64 {
         self.left + (x - self.x.0) / nonzero(self.x.1 - self.x.0) * self.width
     }
 
-    pub(super) fn py(&self, y: f64) -> f64 {
+    pub(crate) fn py(&self, y: f64) -> f64 {
         self.top + self.height - (y - self.y.0) / nonzero(self.y.1 - self.y.0) * self.height
     }
 
-    pub(super) fn bottom(&self) -> f64 {
+    pub(crate) fn bottom(&self) -> f64 {
         self.top + self.height
     }
 
-    pub(super) fn right(&self) -> f64 {
+    pub(crate) fn right(&self) -> f64 {
         self.left + self.width
     }
 
     /// Horizontal grid lines with their numbers.
-    pub(super) fn grid(&self, ticks: &[f64], label: impl Fn(f64) -> String) -> String {
+    pub(crate) fn grid(&self, ticks: &[f64], label: impl Fn(f64) -> String) -> String {
         let lines = ticks.iter().map(|&t| {
             let y = self.py(t);
             format!(
@@ -119,7 +119,7 @@ impl Axes {
     }
 
     /// The line under the plot, numbers below it and the name of the axis below those.
-    pub(super) fn bottom_axis(&self, ticks: &[f64], label: impl Fn(f64) -> String, name: &str) -> String {
+    pub(crate) fn bottom_axis(&self, ticks: &[f64], label: impl Fn(f64) -> String, name: &str) -> String {
         let mut s = format!(
             "<path class=\"axis\" d=\"M{} {}H{}\"/>",
             px(self.left),
@@ -135,7 +135,7 @@ impl Axes {
     }
 
     /// Name of the vertical axis, written upwards at `x`.
-    pub(super) fn side_name(&self, x: f64, name: &str) -> String {
+    pub(crate) fn side_name(&self, x: f64, name: &str) -> String {
         let y = px(self.top + self.height / 2.0);
         let x = px(x);
         format!(
@@ -145,7 +145,7 @@ impl Axes {
     }
 
     /// A point with its interval [`lo`, `hi`] and a title that shows where a pointer rests.
-    pub(super) fn bar(&self, x: f64, y: f64, [lo, hi]: [f64; 2], colour: &str, title: &str) -> String {
+    pub(crate) fn bar(&self, x: f64, y: f64, [lo, hi]: [f64; 2], colour: &str, title: &str) -> String {
         let (x, y) = (self.px(x), self.py(y));
         format!(
             "<g stroke=\"{colour}\" fill=\"{colour}\"><title>{}, 95% {} to {}</title>\
@@ -164,7 +164,7 @@ impl Axes {
     }
 
     /// A line through the points; a gap where one is not finite.
-    pub(super) fn line(&self, points: impl Iterator<Item = (f64, f64)>, style: &str) -> String {
+    pub(crate) fn line(&self, points: impl Iterator<Item = (f64, f64)>, style: &str) -> String {
         let (mut d, mut pen) = (String::new(), 'M');
         for (x, y) in points {
             if x.is_finite() && y.is_finite() {
@@ -183,12 +183,12 @@ fn nonzero(v: f64) -> f64 {
 }
 
 /// Rough width of a text in the drawings' font, in its units.
-pub(super) fn text_width(text: &str) -> f64 {
+pub(crate) fn text_width(text: &str) -> f64 {
     text.chars().count() as f64 * 7.1
 }
 
 /// Entries (label, fill) in rows of at most `width`, the first row centred on `y`. Returns the height taken too.
-pub(super) fn legend(entries: &[(String, String)], left: f64, y: f64, width: f64) -> (String, f64) {
+pub(crate) fn legend(entries: &[(String, String)], left: f64, y: f64, width: f64) -> (String, f64) {
     let (mut s, mut x, mut row) = (String::new(), left, 0.0);
     for (label, fill) in entries {
         let step = 38.0 + text_width(label);
@@ -209,7 +209,7 @@ pub(super) fn legend(entries: &[(String, String)], left: f64, y: f64, width: f64
 }
 
 /// A whole drawing. `label` is what a screen reader says.
-pub(super) fn document(width: f64, height: f64, label: &str, body: &str) -> String {
+pub(crate) fn document(width: f64, height: f64, label: &str, body: &str) -> String {
     format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" class=\"fig\" viewBox=\"0 0 {} {}\" role=\"img\" \
          aria-label=\"{}\">{THEME}{body}</svg>",

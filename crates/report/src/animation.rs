@@ -1,8 +1,9 @@
 //! Animated PNGs of rollouts, and how images are put together.
 
-use super::png_image::{check, side};
-use super::{Error, Result, write_atomic};
+use crate::png_image::{check, side};
+use crate::{Error, Result};
 use e2h_core::{Episode, Image, Outcome};
+use e2h_data::write_atomic;
 use std::path::Path;
 
 const SUCCESS: [u8; 3] = [46, 160, 82];
@@ -17,7 +18,7 @@ const BACKGROUND: [u8; 3] = [24, 28, 34];
 pub fn write_apng(path: &Path, frames: &[Image], fps: u16) -> Result<()> {
     let bytes =
         apng_bytes(frames, fps).map_err(|e| Error::Picture { path: path.to_owned(), source: Box::new(e) })?;
-    write_atomic(path, &bytes)
+    Ok(write_atomic(path, &bytes)?)
 }
 
 /// An animated PNG that plays for ever and holds its last frame for a second.
@@ -124,7 +125,7 @@ pub fn sampled_frames(episode: &Episode, camera: usize, count: usize) -> Vec<Ima
 }
 
 /// Row that sample `i` of `count` shows in an episode of `rows` rows.
-pub(super) fn sample_row(i: usize, count: usize, rows: usize) -> usize {
+pub(crate) fn sample_row(i: usize, count: usize, rows: usize) -> usize {
     let gaps = count.saturating_sub(1).max(1);
     (i * rows.saturating_sub(1) + gaps / 2) / gaps
 }
@@ -212,8 +213,8 @@ fn paste(canvas: &mut Image, image: &Image, x: usize, y: usize) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample;
     use super::*;
+    use crate::sample;
     use std::io::Cursor;
 
     /// Plays an animated PNG as a viewer does: each frame is laid over the picture so far.
@@ -251,7 +252,7 @@ mod tests {
         assert!(played == frames, "frames differ");
         assert_eq!(delays[0], (1, 10));
         assert_eq!(delays.last(), Some(&(10, 10)));
-        let stills: usize = frames.iter().map(|f| super::super::png_bytes(f).unwrap().len()).sum();
+        let stills: usize = frames.iter().map(|f| crate::png_bytes(f).unwrap().len()).sum();
         assert!(bytes.len() * 2 < stills, "{} against {stills} bytes of stills", bytes.len());
         assert_eq!(bytes, apng_bytes(&frames, 10).unwrap());
     }

@@ -1,6 +1,6 @@
 //! Made-up results for tests.
 
-use super::filter::FilterPicture;
+use crate::filter::FilterPicture;
 use crate::record::{Automatic, Collection, Evaluation, IterationRecord, RunResults, wilson95};
 use e2h_core::{Direction, Episode, Image, Observation, Origin};
 

@@ -1,8 +1,8 @@
 //! Charts of one run or several, as inline SVG.
 
-use super::fate;
-use super::svg::{Axes, colour, document, escape, legend, number, percent, px, text_width, ticks};
+use crate::fate;
 use crate::record::{IterationRecord, RunResults};
+use crate::svg::{Axes, colour, document, escape, legend, number, percent, px, text_width, ticks};
 use std::collections::BTreeSet;
 
 const WIDTH: f64 = 720.0;
@@ -295,8 +295,8 @@ fn names(runs: &[&RunResults]) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample;
     use super::*;
+    use crate::sample;
 
     /// The numbers of an SVG path.
     fn path_numbers(d: &str) -> Vec<f64> {

@@ -3,27 +3,69 @@
 use super::Listed;
 use super::page::Head;
 use super::recording::{Account, Recording};
-use crate::config::RunConfig;
-use crate::directory::{Directory, Identity, io};
+use crate::error::io;
+use crate::folder::RunFolder;
 use crate::record::{IterationRecord, Reversal, RunResults};
-use crate::report::{chart, svg::escape};
 use crate::{Error, Result};
-use e2h_core::CONTROL_HZ;
+use crate::{chart, svg::escape};
+use e2h_core::{CONTROL_HZ, one_line};
 use e2h_data::lerobot::Dataset;
-use e2h_refine::kinematic_filter;
+use e2h_refine::{KinematicConfig, ReverseConfig, kinematic_filter};
+use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
 const DEMONSTRATIONS: &str = "demonstrations";
 
+/// What the page needs of a run's configuration; the rest is the run's own affair.
+#[derive(Deserialize)]
+struct Settings {
+    task: TaskSettings,
+    #[serde(rename = "loop")]
+    closed_loop: LoopSettings,
+    refine: RefineSettings,
+}
+
+#[derive(Deserialize)]
+struct TaskSettings {
+    variant: String,
+}
+
+#[derive(Deserialize)]
+struct LoopSettings {
+    demonstrations: usize,
+    refine_easy_demonstrations: bool,
+    explore: ExploreSettings,
+}
+
+#[derive(Deserialize)]
+struct ExploreSettings {
+    enabled: bool,
+}
+
+#[derive(Deserialize)]
+struct RefineSettings {
+    kinematic: KinematicConfig,
+    reverse: ReverseConfig,
+}
+
+impl Settings {
+    fn read(text: &str) -> std::result::Result<Self, String> {
+        let settings: Self =
+            toml::from_str(text).map_err(|e| one_line(&e.to_string().trim().replace('\n', " ")))?;
+        let mut problems = settings.refine.kinematic.validate();
+        problems.extend(settings.refine.reverse.validate());
+        if problems.is_empty() { Ok(settings) } else { Err(one_line(&problems.join("; "))) }
+    }
+}
+
 pub(super) struct RunSource {
     pub(super) listed: Vec<Listed>,
     /// Folder and name of each episode.
     places: Vec<(String, usize)>,
-    dir: Directory,
-    identity: Identity,
+    dir: RunFolder,
     /// The configuration, or why it cannot be read.
-    config: std::result::Result<RunConfig, String>,
+    config: std::result::Result<Settings, String>,
     pub(super) records: Vec<IterationRecord>,
     results: Option<RunResults>,
     /// What refinement made of each reversal, by folder and episode.
@@ -33,17 +75,15 @@ pub(super) struct RunSource {
 
 impl RunSource {
     pub(super) fn open(path: &Path) -> Result<Self> {
-        let (dir, identity) = Directory::existing(path)?;
-        let file = dir.join("config.toml");
+        let dir = RunFolder::open(path)?;
+        let file = path.join("config.toml");
         let text = std::fs::read_to_string(&file).map_err(io("reading", &file))?;
-        let config =
-            RunConfig::from_text(&identity.preset, &text).map(|r| r.config).map_err(|e| e.to_string());
+        let config = Settings::read(&text);
         let mut this = Self {
             listed: vec![],
             places: vec![],
             results: dir.get("results.json")?,
             dir,
-            identity,
             config,
             records: vec![],
             reversals: BTreeMap::new(),
@@ -65,7 +105,7 @@ impl RunSource {
                         this.reversals.insert((segments.clone(), r.episode), account(&iteration, r));
                     }
                 }
-                None if this.dir.join(&segments).exists() => this.notes.push(format!(
+                None if this.dir.path().join(&segments).exists() => this.notes.push(format!(
                     "{iteration} was made before runs kept what the filters made of every frame: it has totals only."
                 )),
                 None => {}
@@ -75,7 +115,7 @@ impl RunSource {
     }
 
     fn list(&mut self, folder: &str) -> Result<()> {
-        let path = self.dir.join(folder);
+        let path = self.dir.path().join(folder);
         if !path.is_dir() {
             return Ok(());
         }
@@ -99,7 +139,7 @@ impl RunSource {
 
     pub(super) fn read(&self, index: usize) -> Result<Recording> {
         let (folder, episode) = &self.places[index];
-        let episode = Dataset::open(self.dir.join(folder))?.read_episode(*episode)?;
+        let episode = Dataset::open(self.dir.path().join(folder))?.read_episode(*episode)?;
         let mut account = self.reversals.get(&(folder.clone(), episode.origin.episode)).cloned();
         let mut own = false;
         if let (DEMONSTRATIONS, Ok(c)) = (folder.as_str(), &self.config)
@@ -109,7 +149,7 @@ impl RunSource {
             account = Some(Account {
                 title: "What the kinematic filter leaves of it for the easy policy".to_owned(),
                 source: episode.source.clone(),
-                fates: refined.fates.iter().map(|f| crate::picture::fate_name(*f).to_owned()).collect(),
+                fates: refined.fates.iter().map(|f| f.name().to_owned()).collect(),
                 speed: refined.speed.iter().map(|&v| f64::from(v)).collect(),
                 ..Account::default()
             });
@@ -123,10 +163,10 @@ impl RunSource {
     /// What the run measured: as it wrote it at its end, or as far as it has come.
     fn measured(&self) -> RunResults {
         self.results.clone().unwrap_or_else(|| RunResults {
-            task: self.identity.task.clone(),
+            task: self.dir.identity().task.clone(),
             variant: self.config.as_ref().map_or(String::new(), |c| c.task.variant.clone()),
-            preset: self.identity.preset.clone(),
-            seed: self.identity.seed,
+            preset: self.dir.identity().preset.clone(),
+            seed: self.dir.identity().seed,
             version: String::new(),
             demonstrations: self.config.as_ref().map_or(0, |c| c.closed_loop.demonstrations),
             explored: self.config.as_ref().is_ok_and(|c| c.closed_loop.explore.enabled),
@@ -200,7 +240,7 @@ fn account(iteration: &str, r: Reversal) -> Account {
     Account {
         title: format!("Easy rollout {} of {iteration}, reversed: what the filters did", r.episode),
         source: r.source,
-        fates: r.fates.into_iter().map(|f| crate::picture::fate_name(f).to_owned()).collect(),
+        fates: r.fates.iter().map(|f| f.name().to_owned()).collect(),
         speed: wide(r.speed),
         excursion: r.excursion.map(wide),
         value: r.value.map(gaps),

@@ -6,8 +6,8 @@ use super::panel::{LINES, limited, panels};
 use super::plot::{Plot, band};
 use super::recording::{Account, Recording};
 use crate::Result;
-use crate::report::fate;
-use crate::report::svg::{escape, number, percent};
+use crate::fate;
+use crate::svg::{escape, number, percent};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Bytes that one point of a line takes.

@@ -17,7 +17,10 @@ use std::path::{Path, PathBuf};
 
 /// Draws success against the number of easy demonstrations, before and after the loop.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Example:\n  cargo run --release --example curve -- checkpoints/curve/cube_pick_place"
+)]
 struct Arguments {
     /// Results of runs of one pair: JSON files, run directories, or folders of either.
     #[arg(required = true)]

@@ -15,7 +15,10 @@ use std::time::UNIX_EPOCH;
 
 /// Writes an HTML page of every episode of a dataset or a run.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example view -- runs/nut_assembly-laptop-0\n  cargo run --release --example view -- recordings/unplug --out unplug.html --episodes 50"
+)]
 struct Arguments {
     /// A LeRobotDataset v3.0 or a run directory.
     dir: PathBuf,

@@ -133,6 +133,12 @@ pub enum Error {
     Core(#[from] e2h_core::Error),
 }
 
+/// Version of the MuJoCo library that this process has loaded.
+#[must_use]
+pub fn mujoco_version() -> &'static str {
+    mujoco_rs::mujoco_version()
+}
+
 fn guess(nearest: &str) -> String {
     if nearest.is_empty() { String::new() } else { format!("did you mean `{nearest}`? ") }
 }

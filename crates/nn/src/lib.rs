@@ -68,6 +68,7 @@ pub use compute::{Compute, Precision, candle_operations};
 pub use error::{Error, Result};
 pub use grad::{Grads, backward, backward_many, no_grad};
 pub use graph::{Given, Gradients, with_gradient};
+pub use kernel::vector_unit;
 pub use layers::{
     Act, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Relu, SpatialSoftmax,
     dropout, repeat_rows, sinusoidal_embedding,

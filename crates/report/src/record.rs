@@ -182,6 +182,22 @@ pub struct RunResults {
     pub demonstration_steps: f64,
 }
 
+/// The runs of a `results.json`: the one of a run directory, or several under `runs` beside a published policy.
+///
+/// # Errors
+/// When the text is neither.
+pub fn parse_results(text: &str) -> serde_json::Result<Vec<RunResults>> {
+    #[derive(Deserialize)]
+    struct Several {
+        runs: Vec<RunResults>,
+    }
+    let value: serde_json::Value = serde_json::from_str(text)?;
+    if value.get("runs").is_some() {
+        return serde_json::from_value::<Several>(value).map(|several| several.runs);
+    }
+    serde_json::from_value(value).map(|run| vec![run])
+}
+
 /// The 95 % Wilson score interval of `k` successes in `n` trials; (0, 1) without trials.
 #[must_use]
 pub fn wilson95(k: usize, n: usize) -> [f64; 2] {

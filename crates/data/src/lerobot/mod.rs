@@ -38,6 +38,7 @@ pub use picture::{decode_image as decode_png, encode as encode_png};
 pub use robot::{ColumnSlice, RobotColumns, Rotation};
 pub use stats::{FeatureStats, QUANTILES, Stats};
 pub use table::{Column, Table};
+pub use video::video_decoder;
 pub use writer::Writer;
 
 #[cfg(test)]

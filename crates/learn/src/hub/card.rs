@@ -3,7 +3,7 @@
 use super::{Files, Publication, read_if_there};
 use crate::config::RunConfig;
 use crate::directory::io;
-use crate::record::RunResults;
+use crate::record::{RunResults, parse_results};
 use crate::report::chart;
 use crate::{Error, Result};
 use e2h_policy::{Checkpoint, Provenance};
@@ -39,23 +39,11 @@ pub(super) fn files(publication: &Publication) -> Result<Files> {
     Ok(files)
 }
 
-/// A `results.json`: of one run, or of several seeds as our checkpoints have it.
-#[derive(serde::Deserialize)]
-struct Several {
-    runs: Vec<RunResults>,
-}
-
 /// What was measured, and the text that says so: beside the checkpoint, or where a run directory has it.
 fn results(dir: &Path) -> Result<Option<(Vec<RunResults>, String)>> {
     for path in [dir.join("results.json"), dir.join("../../results.json")] {
         let Some(text) = read_if_there(&path)? else { continue };
-        let several = serde_json::from_str::<serde_json::Value>(&text).is_ok_and(|v| v.get("runs").is_some());
-        let runs = if several {
-            serde_json::from_str::<Several>(&text).map(|s| s.runs)
-        } else {
-            serde_json::from_str(&text).map(|run| vec![run])
-        };
-        let runs = runs.map_err(|e| Error::Foreign {
+        let runs = parse_results(&text).map_err(|e| Error::Foreign {
             path,
             quantity: "file".to_owned(),
             expected: "results of runs of this version".to_owned(),

@@ -42,7 +42,7 @@ pub use record::{demonstrate, replay};
 pub use render::{MOST_PIXELS, Style};
 pub use scene::{TableCamera, compose, finer};
 pub use sim::{MAX_OPENING, Sim};
-pub use task::{Task, registry, task, variants};
+pub use task::Task;
 pub use tasks::*;
 
 /// What can go wrong in an environment.

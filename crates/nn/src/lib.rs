@@ -42,6 +42,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod builder;
 mod compute;
 mod error;
 mod grad;
@@ -64,6 +65,7 @@ mod weights;
 /// The tensors, the variables and the random numbers of this crate's interface.
 pub use {candle_core, candle_nn, rand_chacha};
 
+pub use builder::{Builder, Mode};
 pub use compute::{Compute, Precision, candle_operations};
 pub use error::{Error, Result};
 pub use grad::{Grads, backward, backward_many, no_grad};
@@ -77,7 +79,7 @@ pub use loss::mse;
 pub use memory::tune_allocator;
 pub use mlp::Mlp;
 pub use optim::{Adam, AdamConfig, Ema, EmaConfig, LrSchedule, learning_rate};
-pub use params::{Builder, Mode, Params};
+pub use params::Params;
 pub use rgb::{RgbEncoder, RgbEncoderConfig};
 pub use unet::{ConditionalUnet1d, UnetConfig};
 pub use weights::{HostTensor, Weights, load_weights, load_weights_without, save_weights};

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7
+//! cargo run --release --example evaluate -- --checkpoint checkpoints/cube_stack --video rollouts.png
 //! ```
 
 #![allow(clippy::print_stdout, reason = "what an example is for")]
@@ -14,7 +15,10 @@ use std::path::{Path, PathBuf};
 
 /// Runs a policy from fresh resets and counts successes.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7\n  cargo run --release --example evaluate -- --checkpoint checkpoints/cube_stack --video rollouts.png"
+)]
 struct Arguments {
     /// Folder with policy.json and model.safetensors, or hf://OWNER/NAME[@revision] (feature `hub`).
     #[arg(long, value_name = "DIR")]

@@ -1,7 +1,9 @@
 //! Is every task pair sound? Scripted demonstrators in both directions, reversed demonstrations replayed, policies that do
 //! not look, starts, contacts and speed.
 //!
-//!     cargo run --release --example experts -- --all --trials 100
+//! ```text
+//! cargo run --release --example experts -- --all --trials 100
+//! ```
 //!
 //! Successes, hard and easy: `experts`; `replay` of reversed easy demonstrations; `starts` in which both predicates are as they should
 //! be; policies that hold `still` or draw `random` goal poses. Then the deepest contact of anything with anything while goals are
@@ -20,7 +22,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 #[derive(Parser)]
-#[command(version)]
+#[command(version, after_help = "Example:\n  cargo run --release --example experts -- --all --trials 100")]
 struct Arguments {
     /// Task pair, with a variant after a colon if not the default one (nut_assembly:square).
     #[arg(long, default_value = "nut_assembly", conflicts_with = "all")]

@@ -4,7 +4,7 @@ use auto_e2h::core::{Failure, mention, say};
 pub(crate) use auto_e2h::learn::Run;
 use auto_e2h::learn::record::RunResults;
 use auto_e2h::learn::{Error, Parts, Result, RunOptions, Stop, report};
-use clap::{Parser, ValueEnum};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, ValueEnum};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -81,7 +81,11 @@ struct Arguments {
 
 /// What the command line asks for.
 fn options(task: &str) -> Result<RunOptions> {
-    let a = Arguments::parse();
+    let command = Arguments::command().after_help(format!(
+        "Examples:\n  cargo run --release --example {task} -- --preset smoke\n  cargo run --release --example {task} -- \
+         --seed 1 --set loop.cycles=20"
+    ));
+    let a = Arguments::from_arg_matches(&command.get_matches()).unwrap_or_else(|e| e.exit());
     let preset = match a.preset {
         Preset::Smoke => "smoke",
         Preset::Laptop => "laptop",

@@ -8,7 +8,8 @@
 //! ```
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
+use clap::Parser;
 use e2h_core::{Direction, Episode, Frames, Observation, Origin, Outcome};
 use e2h_data::lerobot::{Column, Dataset, Writer, features_of};
 use serde_json::{Value, json};
@@ -17,21 +18,26 @@ use sha2::{Digest, Sha256};
 /// Rows of the episodes that `write` makes: one that is sampled, short ones, a single row.
 const ROWS: [usize; 5] = [130, 7, 1, 12, 30];
 
+/// Our side of the checks against LeRobot.
+#[derive(Parser)]
+#[command(version, after_help = "Example:\n  cargo run --release -p e2h-data --example interop -- dump DIR")]
+enum Arguments {
+    /// Writes a dataset of our episodes.
+    Write { dir: String },
+    /// Appends an episode to a dataset.
+    Append { dir: String },
+    /// Prints what is read of a dataset, as JSON.
+    Dump { dir: String },
+    /// Writes the pixels of a dataset's images to a file.
+    Images { dir: String, out: String },
+}
+
 fn main() -> Result<()> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    if let [command, dir, out] = &arguments[..]
-        && command == "images"
-    {
-        return images(dir, out);
-    }
-    let [command, dir] = &arguments[..] else {
-        bail!("usage: interop write|append|dump DIR, or images DIR OUT")
-    };
-    match command.as_str() {
-        "write" => write(dir),
-        "append" => append(dir),
-        "dump" => dump(dir),
-        other => bail!("expected write, append or dump, got `{other}`"),
+    match Arguments::parse() {
+        Arguments::Write { dir } => write(&dir),
+        Arguments::Append { dir } => append(&dir),
+        Arguments::Dump { dir } => dump(&dir),
+        Arguments::Images { dir, out } => images(&dir, &out),
     }
 }
 

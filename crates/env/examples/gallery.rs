@@ -15,7 +15,10 @@ use std::path::{Path, PathBuf};
 
 /// Draws every task pair.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example gallery\n  cargo run --release --example gallery -- --out crates/env/pictures"
+)]
 struct Arguments {
     /// Folder for one PNG a pair.
     #[arg(long, value_name = "DIR", default_value = "runs/gallery")]

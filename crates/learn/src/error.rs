@@ -84,9 +84,9 @@ pub enum Error {
     /// An episode does not hold together.
     #[error(transparent)]
     Core(#[from] e2h_core::Error),
-    /// The report could not be made.
+    /// A record could not be read, or a page, picture or event file could not be made.
     #[error(transparent)]
-    Report(#[from] crate::report::Error),
+    Report(#[from] e2h_report::Error),
 }
 
 fn signal_name(signal: &i32) -> String {

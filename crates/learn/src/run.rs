@@ -403,7 +403,7 @@ impl Run {
         let Lesson { candidates, refined, critic, notes, .. } = lesson;
         let mut fates = BTreeMap::new();
         for fate in refined.iter().flat_map(|r| &r.fates) {
-            *fates.entry(picture::fate_name(*fate).to_owned()).or_default() += 1;
+            *fates.entry(fate.name().to_owned()).or_default() += 1;
         }
         if let Some((episode, refined)) = candidates.iter().zip(&refined).next() {
             let svg = picture::filter(episode, refined, &c.refine.kinematic)?;
@@ -567,7 +567,7 @@ impl Run {
     /// TensorBoard draws folders as curves of one chart, and a stage that goes on voids only its own later steps.
     fn events(&self, stage: &str, step: u64) -> Result<Option<Events>> {
         let folder = self.dir.join("tensorboard").join(stage);
-        self.options.tensorboard.then(|| Events::create(&folder, now(), step)).transpose()
+        Ok(self.options.tensorboard.then(|| Events::create(&folder, now(), step)).transpose()?)
     }
 
     fn provenance(&self, direction: Direction, iteration: u32) -> Result<Provenance> {

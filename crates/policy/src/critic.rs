@@ -1,9 +1,9 @@
 //! The critic: how far along is this frame?
 
 use crate::batch::{Host, Rows};
-use crate::config::without_zero_clip;
 use crate::model::ConditionEncoder;
 use crate::train::{Skipped, sound};
+use crate::train_config::without_zero_clip;
 use crate::{CriticConfig, EncoderNorm, Error, PolicyConfig, Result};
 use candle_core::Tensor;
 use e2h_core::{Episode, Rng, Value, stream};

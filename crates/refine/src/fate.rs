@@ -22,6 +22,22 @@ pub enum Fate {
     DynamicsError,
 }
 
+impl Fate {
+    /// What files call it; its JSON is the same.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Kept => "kept",
+            Self::Static => "static",
+            Self::Resampled => "resampled",
+            Self::LowAdvantage => "low_advantage",
+            Self::TooShort => "too_short",
+            Self::AfterGoal => "after_goal",
+            Self::DynamicsError => "dynamics_error",
+        }
+    }
+}
+
 /// How many frames met which fate. The fates add up to `frames`.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

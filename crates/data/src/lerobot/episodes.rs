@@ -1,7 +1,9 @@
 //! `meta/episodes`: where each episode lies, and its statistics.
 
-use super::feature::{Dtype, Feature, Features, Info};
-use super::parquet_file::{ParquetFile, batch, lists, texts};
+use super::arrow::{batch, lists, texts};
+use super::feature::{Dtype, Feature, Features};
+use super::info::Info;
+use super::parquet_file::ParquetFile;
 use super::stats::{Bounds, FeatureStats, QUANTILES, Stats, bounds};
 use super::table::Column;
 use crate::Result;

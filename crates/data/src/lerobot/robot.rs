@@ -1,6 +1,6 @@
 //! Recordings of any robot as episodes: which column holds the pose, which the gripper.
 
-use super::feature::Info;
+use super::info::Info;
 use super::table::{Table, column_error};
 use crate::{Error, Result};
 use e2h_core::{Episode, Origin, Outcome, align_hemisphere, continue_signs};

@@ -1,7 +1,9 @@
+use super::arrow::{batch, to_arrow};
 use super::dataset::{Dataset, info_path};
 use super::episodes::{self, Entry, EpisodeSpan};
-use super::feature::{DEFAULT_FEATURES, Dtype, Features, INSIDE, Info};
-use super::parquet_file::{ParquetWriter, batch, to_arrow};
+use super::feature::{DEFAULT_FEATURES, Dtype, Features};
+use super::info::{INSIDE, Info};
+use super::parquet_writer::ParquetWriter;
 use super::stats::{self, Stats};
 use super::table::{Column, Table, column_error};
 use super::tasks;

@@ -6,7 +6,7 @@ mod variant;
 use crate::expert::draw;
 use crate::pick_place::down;
 use crate::tabletop::Region;
-use crate::task::{Choice, Entry};
+use crate::tasks::{Choice, Entry};
 use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector2, Vector3};

@@ -4,7 +4,7 @@ use crate::expert::{draw, gauss};
 use crate::pick_place::{GENTLE, down};
 use crate::scene::{compose_two_arms, finer};
 use crate::tabletop::{in_disk, lean};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};

@@ -4,7 +4,7 @@ use crate::expert::{draw, scatter};
 use crate::mjcf::Ring;
 use crate::pick_place::{GENTLE, Symmetry, carry, down, from_above, upright};
 use crate::tabletop::{Region, in_disk, lean, tilt, turn};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task, compose, finer};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;

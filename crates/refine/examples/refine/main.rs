@@ -31,7 +31,10 @@ use std::path::PathBuf;
 
 /// Reverses and filters a dataset of easy-direction episodes.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Example:\n  cargo run --release --example refine -- --dataset recordings/unplug --out refined/plug_in \\\n      --pose observation.state[0:7] --rotation wxyz --gripper observation.state[7] --gripper-range 0,0.08 \\\n      --task \"plug it in\""
+)]
 struct Arguments {
     /// LeRobotDataset v3.0 with episodes of the easy task.
     #[arg(long, value_name = "DIR")]

@@ -81,8 +81,9 @@ struct Arguments {
 
 /// What the command line asks for.
 fn options(task: &str) -> Result<RunOptions> {
+    let example = env!("CARGO_BIN_NAME");
     let command = Arguments::command().after_help(format!(
-        "Examples:\n  cargo run --release --example {task} -- --preset smoke\n  cargo run --release --example {task} -- \
+        "Examples:\n  cargo run --release --example {example} -- --preset smoke\n  cargo run --release --example {example} -- \
          --seed 1 --set loop.cycles=20"
     ));
     let a = Arguments::from_arg_matches(&command.get_matches()).unwrap_or_else(|e| e.exit());

@@ -45,6 +45,8 @@ pub(crate) const STANDARD: [&str; 1] = ["standard"];
 /// What the registry knows of a pair.
 pub(crate) struct Entry {
     pub(crate) name: &'static str,
+    /// Text of its configuration file.
+    pub(crate) config: &'static str,
     /// The default first.
     pub(crate) variants: &'static [&'static str],
     /// None where there is no hole or holder.
@@ -74,6 +76,12 @@ pub(crate) struct Choice {
 pub fn registry() -> &'static [&'static str] {
     static NAMES: LazyLock<Vec<&str>> = LazyLock::new(|| ENTRIES.iter().map(|e| e.name).collect());
     &NAMES
+}
+
+/// Text of a task's configuration file, which is laid over a preset; none for an unknown task.
+#[must_use]
+pub fn configuration(name: &str) -> Option<&'static str> {
+    ENTRIES.iter().find(|e| e.name == name).map(|e| e.config)
 }
 
 /// Names of a task's variants, the default first; empty for an unknown task.

@@ -49,6 +49,7 @@ pub struct Brush {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "brush",
+    config: include_str!("../../../../configs/tasks/brush.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.003, range: [0.001, 0.006] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(Brush { clearance, demonstrator }),

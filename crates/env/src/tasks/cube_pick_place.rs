@@ -40,6 +40,7 @@ pub struct CubePickPlace {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "cube_pick_place",
+    config: include_str!("../../../../configs/tasks/cube_pick_place.toml"),
     variants: &STANDARD,
     clearance: None,
     build: |Choice { demonstrator, .. }| Arc::new(CubePickPlace { demonstrator }),

@@ -43,6 +43,7 @@ pub struct CubeStack {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "cube_stack",
+    config: include_str!("../../../../configs/tasks/cube_stack.toml"),
     variants: &STANDARD,
     clearance: None,
     build: |Choice { demonstrator, .. }| Arc::new(CubeStack { demonstrator }),

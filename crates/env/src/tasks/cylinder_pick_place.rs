@@ -41,6 +41,7 @@ pub struct CylinderPickPlace {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "cylinder_pick_place",
+    config: include_str!("../../../../configs/tasks/cylinder_pick_place.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.004, range: [0.001, 0.012] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(CylinderPickPlace { clearance, demonstrator }),

@@ -44,6 +44,7 @@ pub struct Disk {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "disk",
+    config: include_str!("../../../../configs/tasks/disk.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.004, range: [0.001, 0.006] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(Disk { clearance, demonstrator }),

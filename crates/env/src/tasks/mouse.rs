@@ -38,6 +38,7 @@ pub struct Mouse {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "mouse",
+    config: include_str!("../../../../configs/tasks/mouse.toml"),
     variants: &STANDARD,
     clearance: None,
     build: |Choice { demonstrator, .. }| Arc::new(Mouse { demonstrator }),

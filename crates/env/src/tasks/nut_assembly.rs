@@ -42,6 +42,7 @@ pub struct NutAssembly {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "nut_assembly",
+    config: include_str!("../../../../configs/tasks/nut_assembly.toml"),
     variants: &VARIANTS,
     clearance: None,
     build: |c| Arc::new(NutAssembly::new(c)),

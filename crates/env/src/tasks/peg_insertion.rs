@@ -54,6 +54,7 @@ pub struct PegInsertion {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "peg_insertion",
+    config: include_str!("../../../../configs/tasks/peg_insertion.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.03, range: [0.005, 0.06] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(PegInsertion { clearance, demonstrator }),

@@ -50,6 +50,7 @@ pub struct RodInsertion {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "rod_insertion",
+    config: include_str!("../../../../configs/tasks/rod_insertion.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.002, range: [0.0005, 0.01] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(RodInsertion { clearance, demonstrator }),

@@ -47,6 +47,7 @@ pub struct TestTube {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "test_tube",
+    config: include_str!("../../../../configs/tasks/test_tube.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.003, range: [0.001, 0.006] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(TestTube { clearance, demonstrator }),

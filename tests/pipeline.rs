@@ -2,6 +2,7 @@ use auto_e2h::core::{Direction, Kind, Origin, stream};
 use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
 use auto_e2h::learn::{Collected, Run, RunOptions};
+use auto_e2h::refine::Fate;
 use std::path::Path;
 use std::time::Duration;
 
@@ -71,7 +72,7 @@ fn accepted_rollouts_are_refined_stored_and_learned_from() {
     assert_eq!((c.accepted, c.hard_successes), (3, 3));
     assert_eq!(c.fates.values().sum::<usize>(), frames, "every frame has one fate: {:?}", c.fates);
     assert_eq!(c.frames_kept, accepted.segments.iter().map(|s| s.len()).sum::<usize>());
-    assert!(c.fates["kept"] < frames && c.fates.contains_key("low_advantage"), "{:?}", c.fates);
+    assert!(c.fates[&Fate::Kept] < frames && c.fates.contains_key(&Fate::LowAdvantage), "{:?}", c.fates);
     assert!(c.critic_loss.is_some_and(f64::is_finite));
     assert!(matches!(&c.notes[..], [goals] if goals.starts_with("goals:")), "{:?}", c.notes);
     for segment in &accepted.segments {
@@ -96,7 +97,7 @@ fn without_a_hard_success_the_critic_is_skipped_and_without_rollouts_the_update(
     collected.hard.retain(|e| !e.outcome.is_success());
     let accepted = run.refine(1, collected, Duration::ZERO, &base, &hard).unwrap();
     assert!(accepted.collection.notes.iter().any(|n| n.contains("no hard rollout succeeded")));
-    assert!(!accepted.collection.fates.contains_key("low_advantage"));
+    assert!(!accepted.collection.fates.contains_key(&Fate::LowAdvantage));
     assert!(!accepted.segments.is_empty());
 
     let none = run.refine(2, Collected::default(), Duration::ZERO, &base, &hard).unwrap();

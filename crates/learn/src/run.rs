@@ -16,7 +16,7 @@ use e2h_core::{Direction, Episode, Kind, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_env::{Env, Task, demonstrate};
 use e2h_nn::Compute;
-use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData, train_critic};
+use e2h_policy::{CriticTraining, DiffusionPolicy, Provenance, Trainer, TrainingData, train_critic};
 use e2h_refine::{Goal, Refined, critic_filter, gate, kinematic_filter, reverse};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -410,7 +410,7 @@ impl Run {
         let run = serde_json::to_value(self.config()).map_err(|e| Error::Config(e.to_string()))?;
         Ok(Provenance {
             task: self.options.task.clone(),
-            direction: direction.to_string(),
+            direction: Some(direction),
             preset: self.options.preset.clone(),
             seed: self.options.seed,
             iteration,
@@ -524,25 +524,21 @@ impl Run {
             let name = format!("critic {iteration}");
             let network = &c.critic.network;
             let bar = self.progress.bar(&name, network.steps as u64);
-            let trained = train_critic(
-                &c.policy,
-                network,
-                &self.compute,
-                &base.normaliser,
-                &policy.weights()?,
-                &collected.hard,
-                c.env.horizon_hard,
-                self.options.seed,
-                &format!("critic/{iteration}"),
-                |step, loss| {
-                    bar.set(step as u64, &format!("loss {loss:.4}"));
-                    if self.progress.check().is_ok() {
-                        ControlFlow::Continue(())
-                    } else {
-                        ControlFlow::Break(())
-                    }
-                },
-            );
+            let training = CriticTraining {
+                policy: &c.policy,
+                critic: network,
+                compute: &self.compute,
+                normaliser: &base.normaliser,
+                policy_weights: &policy.weights()?,
+                rollouts: &collected.hard,
+                horizon: c.env.horizon_hard,
+                seed: self.options.seed,
+                purpose: &format!("critic/{iteration}"),
+            };
+            let trained = train_critic(&training, |step, loss| {
+                bar.set(step as u64, &format!("loss {loss:.4}"));
+                if self.progress.check().is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            });
             let (critic, report) = match trained {
                 Err(e2h_policy::Error::Stopped { .. }) => {
                     return Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }));
@@ -577,7 +573,7 @@ impl Run {
 
         let mut fates = BTreeMap::new();
         for fate in refined.iter().flat_map(|r| &r.fates) {
-            *fates.entry(fate.name().to_owned()).or_default() += 1;
+            *fates.entry(*fate).or_default() += 1;
         }
         if let Some((episode, refined)) = candidates.iter().zip(&refined).next() {
             let svg = picture::filter(episode, refined, &r.kinematic)?;

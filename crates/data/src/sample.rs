@@ -52,7 +52,7 @@ impl Sampler {
     #[must_use]
     pub fn batch(&self, size: usize, rng: &mut Rng) -> Vec<Pick> {
         let wanted = self.share * size as f64;
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 <= wanted <= size")]
+        // 0 <= wanted <= size.
         let whole = wanted.floor() as usize;
         let part = wanted - wanted.floor();
         let from_first = whole + usize::from(part > 0.0 && rng.random_bool(part));

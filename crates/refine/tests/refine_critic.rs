@@ -231,7 +231,7 @@ fn a_critic_that_does_not_fit_is_refused_with_what_was_expected_and_found() {
     let json = std::fs::read_to_string(critic.join("critic.json")).unwrap();
     std::fs::write(critic.join("critic.json"), json.replace("\"state_dim\": 15", "\"state_dim\": 16"))
         .unwrap();
-    assert!(refused(&[]).contains("state_dim: expected 15, found 16"));
+    assert!(refused(&[]).contains("expected state_dim 15, found 16"));
     std::fs::write(critic.join("critic.json"), json.replace("\"format\": 1", "\"format\": 7")).unwrap();
     assert!(refused(&[]).contains("expected format 1, found 7"));
     std::fs::write(critic.join("critic.json"), &json).unwrap();

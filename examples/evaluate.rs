@@ -41,7 +41,7 @@ struct Arguments {
     /// Where the policy is computed: cpu, cuda or cuda:N.
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Threads (by default one a core); never changes a result.
+    /// Threads (by default one per core); never changes a result.
     #[arg(long)]
     threads: Option<usize>,
 }

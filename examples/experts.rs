@@ -8,7 +8,7 @@
 //! Successes, hard and easy: `experts`; `replay` of reversed easy demonstrations; `starts` in which both predicates are as they should
 //! be; policies that hold `still` or draw `random` goal poses. Then the deepest contact of anything with anything while goals are
 //! drawn every step (trembling) and every 20 steps (sweeping, with all the force that the arm has), and control steps a second
-//! with both cameras. About a minute a pair on two cores. `--json` prints one line a variant and nothing else.
+//! with both cameras. About a minute per pair on two cores. `--json` prints one line per variant and nothing else.
 #![allow(clippy::print_stdout, reason = "what an example is for")]
 
 use anyhow::Result;

@@ -68,7 +68,7 @@ struct Arguments {
     /// Override a value of the configuration, for example loop.cycles=20 (may be repeated).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Threads (by default one a core); never changes a result.
+    /// Threads (by default one per core); never changes a result.
     #[arg(long)]
     threads: Option<usize>,
     /// Show no progress.

@@ -92,7 +92,7 @@ fn append(dir: &str) -> Result<()> {
     Ok(())
 }
 
-/// Every number, and the SHA-256 of every image's pixels, one JSON line an episode.
+/// Every number, and the SHA-256 of every image's pixels, one JSON line per episode.
 fn dump(dir: &str) -> Result<()> {
     let dataset = Dataset::open(dir)?;
     for i in 0..dataset.len() {
@@ -115,7 +115,7 @@ fn dump(dir: &str) -> Result<()> {
     Ok(())
 }
 
-/// The first camera's frames as files, a folder an episode.
+/// The first camera's frames as files, a folder per episode.
 fn images(dir: &str, out: &str) -> Result<()> {
     let dataset = Dataset::open(dir)?;
     let camera = dataset.info().features.iter().find(|(_, f)| f.is_visual()).context("a camera")?.0.clone();

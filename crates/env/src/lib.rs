@@ -35,7 +35,7 @@ mod tasks;
 
 pub use arm::PosturePull;
 pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
-pub use env::{CAMERAS, Env};
+pub use env::{CAMERAS, Env, Snapshot};
 pub use expert::{Expert, Phase, Script};
 pub use probe::{Blind, Probed, probe};
 pub use record::{demonstrate, replay};
@@ -108,7 +108,7 @@ pub enum Error {
         task: &'static str,
         /// What it can be.
         expected: String,
-        /// What was asked for, m a side.
+        /// What was asked for, m per side.
         found: f64,
     },
     /// An action that no controller can follow.

@@ -54,7 +54,7 @@ pub(crate) struct Entry {
     pub(crate) build: fn(Choice) -> Arc<dyn Task>,
 }
 
-/// Free space between an object and the hole or holder that it goes into, m a side.
+/// Free space between an object and the hole or holder that it goes into, m per side.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Clearance {
     pub(crate) default: f64,
@@ -66,7 +66,7 @@ pub(crate) struct Clearance {
 #[derive(Debug, Clone)]
 pub(crate) struct Choice {
     pub(crate) variant: &'static str,
-    /// m a side; 0 where the pair has none.
+    /// m per side; 0 where the pair has none.
     pub(crate) clearance: f64,
     pub(crate) demonstrator: DemonstratorConfig,
 }
@@ -121,7 +121,7 @@ fn clearance(entry: &Entry, given: f64) -> Result<f64> {
         Some(c) if given == 0.0 => Ok(c.default),
         Some(c) if (c.range[0]..=c.range[1]).contains(&given) => Ok(given),
         Some(Clearance { default, range: [low, high] }) => {
-            refuse(format!("{low} to {high} m a side, or 0 for the default of {default}"))
+            refuse(format!("{low} to {high} m per side, or 0 for the default of {default}"))
         }
         None if given == 0.0 => Ok(0.0),
         None => refuse("0, because the pair has no hole or holder of variable size".to_owned()),

@@ -42,9 +42,6 @@ pub enum Error {
     /// The system does not let signals be handled.
     #[error("handling signals: {0}")]
     Signals(std::io::Error),
-    /// This build cannot do what was asked.
-    #[error("{0}")]
-    Unsupported(String),
     /// A demonstrator could not do its task.
     #[error("{0}")]
     Demonstrations(String),

@@ -120,7 +120,7 @@ fn all() -> Result<()> {
 #[derive(Parser)]
 #[command(version, after_help = "Example:\n  cargo run --release -p e2h-nn --example speed -- 2 encoder")]
 struct Arguments {
-    /// Threads (by default one a core).
+    /// Threads (by default one per core).
     threads: Option<usize>,
     /// Times only what has this in its name.
     part: Option<String>,

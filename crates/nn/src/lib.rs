@@ -82,4 +82,4 @@ pub use optim::{Adam, AdamConfig, Ema, EmaConfig, LrSchedule, learning_rate};
 pub use params::Params;
 pub use rgb::{RgbEncoder, RgbEncoderConfig};
 pub use unet::{ConditionalUnet1d, UnetConfig};
-pub use weights::{HostTensor, Weights, load_weights, load_weights_without, save_weights};
+pub use weights::{HostTensor, Weights, load_weights, load_weights_without, parse_weights, save_weights};

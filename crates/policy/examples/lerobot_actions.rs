@@ -92,7 +92,7 @@ impl Inputs {
     }
 
     /// Images of one step.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole numbers from 0 to 255")]
+    // Whole numbers from 0 to 255.
     fn images(&self, step: usize) -> Vec<Image> {
         let Some(t) = self.0.get("images") else { return vec![] };
         let [_, cameras, height, width, _] = t.shape[..] else { return vec![] };

@@ -105,7 +105,7 @@ pub struct PolicyConfig {
     /// True scales the quaternion of every action to length 1; false leaves it as predicted (LeRobot).
     #[serde(default = "yes", skip_serializing_if = "Clone::clone")]
     pub unit_quaternion: bool,
-    /// Scaling of the images, one entry a camera; none leaves them in [0, 1].
+    /// Scaling of the images, one entry per camera; none leaves them in [0, 1].
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub image_scaling: Vec<ImageScaling>,
     /// Adds the object's pose in the frame of the tool, position and rotation: a grasp looks the same at every yaw.
@@ -123,20 +123,12 @@ fn state_limit() -> f32 {
     STATE_LIMIT
 }
 
-#[allow(
-    clippy::trivially_copy_pass_by_ref,
-    clippy::float_cmp,
-    reason = "serde's signature; an exact default"
-)]
+// Serde's signature; an exact default.
 fn is_state_limit(limit: &f32) -> bool {
     *limit == STATE_LIMIT
 }
 
-#[allow(
-    clippy::trivially_copy_pass_by_ref,
-    clippy::float_cmp,
-    reason = "serde's signature; an exact default"
-)]
+// Serde's signature; an exact default.
 fn yes() -> bool {
     true
 }

@@ -29,6 +29,7 @@ mod critic;
 mod critic_file;
 mod ddim;
 mod error;
+mod folder;
 pub mod lerobot;
 mod model;
 mod policy;
@@ -37,7 +38,7 @@ mod train_config;
 
 pub use checkpoint::{CHECKPOINT_FORMAT, Checkpoint, Provenance};
 pub use config::{EncoderNorm, ImageScaling, PolicyConfig, Prediction, SamplerKind};
-pub use critic::{Critic, CriticReport, train_critic};
+pub use critic::{Critic, CriticReport, CriticTraining, train_critic};
 pub use critic_file::{CRITIC_FORMAT, CriticProvenance};
 pub use ddim::{Ddim, DdimStep};
 pub use error::{Error, Result};

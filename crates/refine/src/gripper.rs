@@ -1,5 +1,6 @@
 use crate::{ReverseConfig, limits};
-use e2h_core::Episode;
+use e2h_core::{Episode, state};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 /// Whether the gripper counts as open at every row: open above `open_at`, closed below `close_at`, in between as before.
@@ -80,18 +81,22 @@ pub fn gate(episode: &Episode, config: &GateConfig, reverse: &ReverseConfig) -> 
 /// Object that moves less than this in a control step is not being carried, m.
 const CARRIED: f64 = 0.001;
 
+fn object(episode: &Episode, t: usize) -> Vector3<f64> {
+    Vector3::from(state::object_position(&episode.state[t]).map(f64::from))
+}
+
 /// How far the object moved in the closed hand while it was carried, m: the largest distance of its position in the frame of the
 /// hand from that halfway. 0 where nothing is carried.
 #[must_use]
 pub fn slip(episode: &Episode, config: &ReverseConfig) -> f64 {
     let open = open_states(episode, config);
     let carried = (1..episode.len()).filter(|&t| {
-        let moved = episode.object(t).position - episode.object(t - 1).position;
+        let moved = object(episode, t) - object(episode, t - 1);
         !open[t] && !open[t - 1] && moved.norm() > CARRIED
     });
     let in_hand = |t: usize| {
-        let (hand, object) = (episode.eef(t), episode.object(t));
-        hand.orientation.inverse() * (object.position - hand.position)
+        let hand = episode.eef(t);
+        hand.orientation.inverse() * (object(episode, t) - hand.position)
     };
     let places: Vec<_> = carried.map(in_hand).collect();
     let Some(middle) = places.get(places.len() / 2) else { return 0.0 };
@@ -124,11 +129,12 @@ mod tests {
     #[test]
     fn what_slips_in_the_hand_does_not_pass() {
         let carried = |slip: f32| {
-            let mut e = along(&(0..12).map(|t| 0.02 * t as f32).collect::<Vec<_>>());
+            let mut e = along(&(0..12).map(|t| 0.02 * f64::from(t)).collect::<Vec<_>>());
             for (t, s) in e.state.iter_mut().enumerate() {
                 s[14] = if (2..10).contains(&t) { 0.03 } else { 0.08 };
-                let hand = s[0].min(0.18).max(0.04);
-                s[7..10].copy_from_slice(&[hand, s[1], s[2] - 0.02 + if t > 6 { slip } else { 0.0 }]);
+                let hand = s[0].clamp(0.04, 0.18);
+                let height = s[2] - 0.02 + if t > 6 { slip } else { 0.0 };
+                (s[7], s[8], s[9]) = (hand, s[1], height);
             }
             e
         };

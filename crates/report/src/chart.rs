@@ -173,8 +173,8 @@ pub fn fates(results: &RunResults) -> String {
         .filter_map(|r| {
             let collection = r.collection.as_ref()?;
             let mut parts = vec![0.0; fate::RANKS];
-            for (name, n) in &collection.fates {
-                parts[fate::rank(name)] += *n as f64;
+            for (fate, n) in &collection.fates {
+                parts[fate::rank(fate.name())] += *n as f64;
             }
             let total = format!("{} frames", collection.fates.values().sum::<usize>());
             Some(Row { name: r.iteration.to_string(), parts, total })

@@ -15,7 +15,7 @@ type Threshold = (f32, &'static str);
 /// Name, column if there is one, thresholds.
 type Curve<'a> = (&'static str, Option<&'a Vec<f32>>, &'a [Threshold]);
 
-/// One reversed rollout as the filters saw it. Columns have one entry a frame that went in, T; a shorter one is drawn
+/// One reversed rollout as the filters saw it. Columns have one entry per frame that went in, T; a shorter one is drawn
 /// as far as it goes. Fields that a caller has no use for come from `..FilterPicture::default()`.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FilterPicture {
@@ -59,7 +59,7 @@ impl FilterPicture {
     /// The totals in words, for example `120 frames: 80 kept (67%), 40 static (33%)`.
     #[must_use]
     pub fn totals_text(&self) -> String {
-        fate::totals(&self.totals())
+        fate::totals(self.totals().iter().map(|(name, n)| (name.as_str(), *n)))
     }
 
     /// The picture: sampled images on top, then value, advantage, dynamics error, excursion and speed over time with their

@@ -195,13 +195,16 @@ fn collection_table(results: &RunResults) -> String {
         .map(|(r, c)| {
             let notes: String =
                 c.notes.iter().map(|n| format!("; {}", escape(n.trim_end_matches('.')))).collect();
-            format!("<li>Iteration {}: {}{notes}.</li>\n", r.iteration, escape(&fate::totals(&c.fates)))
+            format!(
+                "<li>Iteration {}: {}{notes}.</li>\n",
+                r.iteration,
+                escape(&fate::totals(c.fates.iter().map(|(f, n)| (f.name(), *n))))
+            )
         })
         .collect();
     table(&head, &rows) + &format!("<ul class=\"note\">\n{details}</ul>\n")
 }
 
-/// Total, then each cause with its count.
 /// The automatic-reset rate; of both kinds of cycles where there were both.
 fn automatic(c: &Collection) -> String {
     let all = percent(c.automatic_reset_rate());
@@ -214,14 +217,11 @@ fn automatic(c: &Collection) -> String {
     }
 }
 
+/// Total, then each cause with its count.
 fn resets(c: &Collection) -> String {
     let total: usize = c.resets.values().sum();
-    let causes: Vec<String> = c
-        .resets
-        .iter()
-        .filter(|(_, n)| **n > 0)
-        .map(|(cause, n)| format!("{} {n}", escape(&cause.replace('_', " "))))
-        .collect();
+    let causes: Vec<String> =
+        c.resets.iter().filter(|(_, n)| **n > 0).map(|(cause, n)| format!("{} {n}", cause.words())).collect();
     if causes.is_empty() {
         total.to_string()
     } else {
@@ -268,12 +268,10 @@ mod tests {
         results.machine = "<script>alert(1)</script>".into();
         if let Some(c) = &mut results.iterations[1].collection {
             c.notes.push("a < b".into());
-            c.resets.insert("<i>".into(), 1);
-            c.fates.insert("<u>".into(), 1);
         }
         let config = "name = \"<b>&amp;\"\nx = '</pre><script>'\n";
         let page = html(&results, config, &pictures());
-        for bad in ["<script", "<b>&amp;\"", "a < b", "<i>", "<u>", "<3>"] {
+        for bad in ["<script", "<b>&amp;\"", "a < b", "<3>"] {
             assert!(!page.contains(bad), "{bad}");
         }
         assert!(page.contains("name = &quot;&lt;b&gt;&amp;amp;&quot;"));

@@ -28,7 +28,7 @@ pub struct IterationRecord {
     pub evaluation: Evaluation,
     /// Minutes since the run started (its own time only, also across resumes).
     pub minutes: f64,
-    /// Minutes a stage of this iteration: `collect`, `refine`, `critic`, `train`, `evaluate`, ...
+    /// Minutes by stage of this iteration: `collect`, `refine`, `critic`, `train`, `evaluate`, ...
     pub stage_minutes: BTreeMap<String, f64>,
     /// Closed-loop collection that fed this update; none for the initial policy.
     pub collection: Option<Collection>,
@@ -49,26 +49,62 @@ pub struct Collection {
     pub easy_successes: usize,
     /// Easy rollouts started.
     pub easy_rollouts: usize,
-    /// External resets by cause, for example `hard_failed`, `easy_failed`, `diverged`, `start`.
-    pub resets: BTreeMap<String, usize>,
+    /// External resets by cause.
+    pub resets: BTreeMap<ResetCause, usize>,
     /// Cycles whose easy rollout explored; none in records from before there was exploration.
     #[serde(default)]
     pub explored: Automatic,
     /// The other cycles.
     #[serde(default)]
     pub plain: Automatic,
-    /// Easy rollouts whose reversal passed the gripper gate.
+    /// Easy rollouts whose reversal passed the gripper gate and the goal gate.
     pub accepted: usize,
     /// Frames of the accepted reversals by fate; the values add up to the frames that went in.
-    pub fates: BTreeMap<String, usize>,
+    pub fates: BTreeMap<Fate, usize>,
     /// Segments that went into training from this round.
     pub segments: usize,
     /// Frames that went into training from this round.
     pub frames_kept: usize,
-    /// Mean validation loss of the critic; none when the critic stage was skipped.
+    /// Loss of the critic on the rollouts held out, or its training loss where none was; none when the critic stage was skipped.
     pub critic_loss: Option<f64>,
     /// Why a stage was skipped, in words; empty when none was.
     pub notes: Vec<String>,
+}
+
+/// Why the scene was reset from outside. In the order of the alphabet, which is the order in files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ResetCause {
+    /// The simulation diverged in a rollout.
+    Diverged,
+    /// The object was dropped in a task that must hold it throughout.
+    Dropped,
+    /// The easy rollout did not succeed.
+    EasyFailed,
+    /// The hard rollout did not succeed.
+    HardFailed,
+    /// The simulation diverged on the way home.
+    HomingDiverged,
+    /// The simulation diverged in a reset, which was drawn again.
+    ResetDiverged,
+    /// The first placement of each loop.
+    Start,
+}
+
+impl ResetCause {
+    /// What it is called in words.
+    #[must_use]
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::Diverged => "diverged",
+            Self::Dropped => "dropped",
+            Self::EasyFailed => "easy failed",
+            Self::HardFailed => "hard failed",
+            Self::HomingDiverged => "homing diverged",
+            Self::ResetDiverged => "reset diverged",
+            Self::Start => "start",
+        }
+    }
 }
 
 /// How one kind of cycle went on by itself.
@@ -102,7 +138,8 @@ impl Collection {
     /// Share of cycles that needed no external reset, in [0, 1] (the paper's automatic-reset rate).
     #[must_use]
     pub fn automatic_reset_rate(&self) -> f64 {
-        let resets: usize = self.resets.iter().filter(|(cause, _)| *cause != "start").map(|(_, n)| n).sum();
+        let resets: usize =
+            self.resets.iter().filter(|(cause, _)| **cause != ResetCause::Start).map(|(_, n)| n).sum();
         if self.cycles == 0 { 0.0 } else { 1.0 - (resets.min(self.cycles) as f64 / self.cycles as f64) }
     }
 }
@@ -228,10 +265,21 @@ mod tests {
     }
 
     #[test]
+    fn files_say_causes_and_fates_by_name() {
+        let mut c = Collection::default();
+        c.resets.extend([(ResetCause::HardFailed, 2), (ResetCause::Diverged, 1)]);
+        c.fates.extend([(Fate::Kept, 5), (Fate::AfterGoal, 3)]);
+        let text = serde_json::to_string(&c).unwrap();
+        assert!(text.contains(r#""resets":{"diverged":1,"hard_failed":2}"#), "{text}");
+        assert!(text.contains(r#""fates":{"after_goal":3,"kept":5}"#), "{text}");
+        assert_eq!(serde_json::from_str::<Collection>(&text).unwrap(), c);
+    }
+
+    #[test]
     fn automatic_resets_leave_the_first_placement_out() {
         let mut c = Collection { cycles: 10, ..Collection::default() };
-        c.resets.insert("start".to_owned(), 8);
-        c.resets.insert("easy_failed".to_owned(), 2);
+        c.resets.insert(ResetCause::Start, 8);
+        c.resets.insert(ResetCause::EasyFailed, 2);
         assert!((c.automatic_reset_rate() - 0.8).abs() < 1e-12);
     }
 }

@@ -1,8 +1,9 @@
 //! Made-up results for tests.
 
 use crate::filter::FilterPicture;
-use crate::record::{Automatic, Collection, Evaluation, IterationRecord, RunResults, wilson95};
+use crate::record::{Automatic, Collection, Evaluation, IterationRecord, ResetCause, RunResults, wilson95};
 use e2h_core::{Direction, Episode, Image, Observation, Origin};
+use e2h_refine::Fate;
 
 /// A run whose success rate climbs, with `iterations` rows.
 pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
@@ -11,7 +12,6 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
         let k = [6, 14, 27, 33, 41, 46, 48, 49, 50][n.min(8)] - (seed as usize * 2).min(5);
         let stages = [("collect", 3.1), ("refine", 0.4), ("critic", 2.2), ("train", 7.5), ("evaluate", 1.3)];
         let skip = if i == 0 { 2 } else { 0 };
-        let count = |pairs: &[(&str, usize)]| pairs.iter().map(|(k, n)| ((*k).to_owned(), *n)).collect();
         IterationRecord {
             iteration: i,
             evaluation: Evaluation {
@@ -32,17 +32,24 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
                 hard_successes: 8 + 5 * n,
                 easy_successes: 33 + n / 2,
                 easy_rollouts: 40,
-                resets: count(&[("start", 8), ("hard_failed", 12 - n), ("easy_failed", 4), ("diverged", 1)]),
+                resets: [
+                    (ResetCause::Start, 8),
+                    (ResetCause::HardFailed, 12 - n),
+                    (ResetCause::EasyFailed, 4),
+                    (ResetCause::Diverged, 1),
+                ]
+                .into(),
                 explored: Automatic { cycles: 30, easy_successes: 24, resets: 8 },
                 plain: Automatic { cycles: 10, easy_successes: 9, resets: 1 },
                 accepted: 29 + n / 2,
-                fates: count(&[
-                    ("kept", 5200 + 90 * n),
-                    ("static", 1400 - 50 * n),
-                    ("resampled", 900),
-                    ("low_advantage", if i == 1 { 0 } else { 1700 }),
-                    ("too_short", 130),
-                ]),
+                fates: [
+                    (Fate::Kept, 5200 + 90 * n),
+                    (Fate::Static, 1400 - 50 * n),
+                    (Fate::Resampled, 900),
+                    (Fate::LowAdvantage, if i == 1 { 0 } else { 1700 }),
+                    (Fate::TooShort, 130),
+                ]
+                .into(),
                 segments: 61 + n,
                 frames_kept: 6000 + 90 * n,
                 critic_loss: (i > 1).then_some(0.021 / f64::from(i)),

@@ -50,7 +50,7 @@ pub(crate) fn number(v: f64) -> String {
     if !(-4.0..6.0).contains(&magnitude) {
         return format!("{v:.2e}");
     }
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and 6")]
+    // Between 0 and 6.
     let decimals = (2.0 - magnitude).max(0.0) as usize;
     let text = format!("{v:.decimals$}");
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }

@@ -82,7 +82,7 @@ impl Events {
     /// # Errors
     /// When the file cannot be written.
     pub fn scalar(&mut self, tag: &str, step: u64, wall_time: f64, value: f64) -> Result<()> {
-        #[allow(clippy::cast_possible_truncation, reason = "the format has 32 bits for it")]
+        // The format has 32 bits for it.
         let scalars = vec![(tag.to_owned(), value as f32)];
         self.write(&Event { wall_time, step: signed(step), scalars, ..Event::default() })
     }

@@ -4,7 +4,7 @@
 
 use e2h_core::{Direction, Episode, Frames, Kind, Observation, Origin, Outcome};
 use e2h_data::lerobot::{Column, Dtype, Feature, Table, Writer, features_of};
-use e2h_refine::{KinematicConfig, ReverseConfig, kinematic_filter, reverse};
+use e2h_refine::{Fate, KinematicConfig, ReverseConfig, kinematic_filter, reverse};
 use e2h_report::record::{Collection, Evaluation, IterationRecord, Reversal, wilson95};
 use e2h_report::view::{Options, write, write_scalars};
 use std::path::{Path, PathBuf};
@@ -155,7 +155,7 @@ fn run(dir: &Path) -> Vec<Episode> {
             easy_rollouts: 2,
             easy_successes: 1,
             accepted: 1,
-            fates: [("kept".to_owned(), kept), ("static".to_owned(), 90 - kept)].into(),
+            fates: [(Fate::Kept, kept), (Fate::Static, 90 - kept)].into(),
             segments: refined.segments.len(),
             frames_kept: kept,
             ..Collection::default()

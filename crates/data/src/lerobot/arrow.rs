@@ -68,7 +68,7 @@ pub(super) fn from_arrow(array: &ArrayRef, feature: &Feature, place: &Cell) -> R
     }
     place.whole(leaf.as_ref(), width)?;
     if leaf.len() != rows * width {
-        return Err(place.error(None, format!("{width} numbers a row"), leaf.len().to_string()));
+        return Err(place.error(None, format!("{width} numbers per row"), leaf.len().to_string()));
     }
     let found = || place.unsupported(feature.describe(), array.data_type().to_string());
     fn values<T: ArrowPrimitiveType>(leaf: &ArrayRef) -> &[T::Native] {
@@ -76,7 +76,7 @@ pub(super) fn from_arrow(array: &ArrayRef, feature: &Feature, place: &Cell) -> R
     }
     Ok(match (Column::empty(feature.dtype), leaf.data_type()) {
         (Column::F32(_), DataType::Float32) => Column::F32(values::<Float32Type>(&leaf).to_vec()),
-        #[allow(clippy::cast_possible_truncation, reason = "the feature says 32 bits")]
+        // The feature says 32 bits.
         (Column::F32(_), DataType::Float64) => {
             Column::F32(values::<Float64Type>(&leaf).iter().map(|&v| v as f32).collect())
         }

@@ -21,11 +21,11 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FaultKind {
-    /// The rows are whole; what is noted of them beside is missing or out of date. [`repair`] takes it anew from the rows.
+    /// The rows are whole; what is noted of them beside is missing or out of date. [`repair`](super::repair()) takes it anew from the rows.
     Stale,
-    /// Not read here, which says nothing of the rows. As long as there is one, [`repair`] touches nothing.
+    /// Not read here, which says nothing of the rows. As long as there is one, [`repair`](super::repair()) touches nothing.
     Unsupported,
-    /// Lost. [`repair`] cuts it off.
+    /// Lost. [`repair`](super::repair()) cuts it off.
     Damage,
 }
 
@@ -50,7 +50,7 @@ pub struct Fault {
     pub kind: FaultKind,
     /// The first episode that it is found in; none where it is none's.
     pub episode: Option<usize>,
-    /// Whether [`repair`] can do something about it.
+    /// Whether [`repair`](super::repair()) can do something about it.
     pub repairable: bool,
 }
 

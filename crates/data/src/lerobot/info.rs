@@ -70,7 +70,7 @@ fn video_file_size() -> usize {
 
 /// LeRobot writes whole rates as integers and compares them as such.
 fn whole_rate(fps: f64) -> Value {
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole and below 2^32")]
+    // Whole and below 2^32.
     if fps.fract() == 0.0 && (0.0..4e9).contains(&fps) { (fps as u64).into() } else { fps.into() }
 }
 

@@ -24,7 +24,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Key of the checksums in a file's footer: a list of `[first byte, end byte, SHA-256]`, one a row group.
+/// Key of the checksums in a file's footer: a list of `[first byte, end byte, SHA-256]`, one per row group.
 pub(super) const CHECKSUMS: &str = "auto_e2h.sha256";
 /// Rows decoded at once: images of some seconds.
 const BATCH: usize = 64;
@@ -203,7 +203,7 @@ impl ParquetFile {
         let text =
             entries.and_then(|e| e.iter().find(|kv| kv.key == CHECKSUMS)).and_then(|kv| kv.value.as_ref());
         let Some(text) = text else { return Ok(None) };
-        let bad = |found: String| file_error(&self.path, CHECKSUMS, "one checksum a row group", found);
+        let bad = |found: String| file_error(&self.path, CHECKSUMS, "one checksum per row group", found);
         let sums: Vec<Checksum> = serde_json::from_str(text).map_err(|e| bad(e.to_string()))?;
         let groups = self.metadata.metadata().num_row_groups();
         if sums.len() != groups {

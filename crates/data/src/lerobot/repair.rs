@@ -171,7 +171,7 @@ fn renew_rows(dataset: &Dataset, file: (usize, usize), done: &mut Vec<String>) -
     for (episode, span) in dataset.episodes().iter().enumerate().filter(|(_, e)| e.file == file) {
         end += span.length;
         ends.push(end);
-        #[allow(clippy::cast_possible_truncation, reason = "LeRobot keeps times as f32")]
+        // LeRobot keeps times as f32.
         times.extend((0..span.length).map(|row| (row as f64 / fps) as f32));
         index.extend((0..span.length).map(|row| i64::try_from(span.from + row).unwrap_or(i64::MAX)));
         number.extend(std::iter::repeat_n(i64::try_from(episode).unwrap_or(i64::MAX), span.length));

@@ -36,7 +36,7 @@ const LAID: (f64, f64) = (0.025, 15.0 * PI / 180.0);
 const LEAN_BACK: f64 = PI / 4.0;
 
 /// The pair `brush`. Hard: a brush goes from its cradle, where it lies, into its holder, where it stands. Easy: it goes back.
-/// On the way the hand turns by a quarter. Default clearance 3 mm a side.
+/// On the way the hand turns by a quarter. Default clearance 3 mm per side.
 ///
 /// # Source
 /// A twin of the paper's real pair; sizes are ours.

@@ -28,7 +28,7 @@ const GRASP: f64 = 0.022;
 const YAW: f64 = 0.5;
 
 /// The pair `cylinder_pick_place`. Hard: a cylinder goes from the table into a ring that it stands in. Easy: it comes out
-/// and back. Default clearance 4 mm a side.
+/// and back. Default clearance 4 mm per side.
 ///
 /// # Source
 /// The paper's Isaac pair; sizes are ours.

@@ -30,7 +30,7 @@ const SIDES: u32 = 12;
 
 /// The pair `disk`. Hard: a disk goes from the table over a rod and down. Easy: it comes off and back to the table.
 ///
-/// The hole is the rod's radius and the clearance (default 4 mm a side) wide. The disk is as wide as the hand opens, so it
+/// The hole is the rod's radius and the clearance (default 4 mm per side) wide. The disk is as wide as the hand opens, so it
 /// has a hub round its hole to be held by.
 ///
 /// # Source

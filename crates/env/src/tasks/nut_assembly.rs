@@ -24,8 +24,8 @@ const SEAT: (f64, f64) = (0.03, 0.05);
 
 /// The pair `nut_assembly`. Hard: the nut goes from the table over the peg. Easy: it comes off and back to the table.
 ///
-/// Variants: `loose` (the round nut of the released TR-DRL scene, about 47 mm a side), `round` and `square` (robosuite's
-/// own, 16 and 7 mm a side).
+/// Variants: `loose` (the round nut of the released TR-DRL scene, about 47 mm per side), `round` and `square` (robosuite's
+/// own, 16 and 7 mm per side).
 ///
 /// # Source
 /// TR-DRL (arXiv 2505.13925) and robosuite's pegs arena: shapes, start boxes and predicates.

@@ -41,7 +41,7 @@ const START: ([f64; 2], f64) = ([-0.04, 0.04], 0.04);
 /// home. There are no grippers; the second arm only holds the plate, and what the state calls the object is the hole.
 ///
 /// # Source
-/// robosuite's `TwoArmPegInHole` and TR-DRL's `TwoArmPegRemoval`: sizes (default clearance 30 mm a side) and predicates.
+/// robosuite's `TwoArmPegInHole` and TR-DRL's `TwoArmPegRemoval`: sizes (default clearance 30 mm per side) and predicates.
 /// Differs: the peg's radius is fixed; the hole's middle is that of its opening (robosuite's is 10 mm off); the peg starts 45
 /// degrees off the hole's axis (there 90), within reach of two Pandas side by side; starts are spread by 40 mm, over the
 /// states in which the easy task ends.

@@ -37,10 +37,10 @@ const START_YAW: f64 = 0.4;
 /// The pair `rod_insertion`. Hard: a rod goes into a hole. Easy: it comes out, to a random pose of the start region. The hand
 /// holds it throughout: a dropped rod ends the episode.
 ///
-/// The rod's ends are round, which stands for the chamfer that such pegs have. Default clearance 2 mm a side.
+/// The rod's ends are round, which stands for the chamfer that such pegs have. Default clearance 2 mm per side.
 ///
 /// # Source
-/// The paper's Isaac pair; sizes are ours (Factory's peg has 0.06 mm a side, which a position-controlled arm cannot meet).
+/// The paper's Isaac pair; sizes are ours (Factory's peg has 0.06 mm per side, which a position-controlled arm cannot meet).
 #[derive(Debug, Clone)]
 pub struct RodInsertion {
     clearance: f64,

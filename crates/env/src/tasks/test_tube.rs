@@ -23,7 +23,7 @@ struct Hole {
 }
 const RACK: Hole = Hole { at: [0.62, 0.10], rim: 0.06, floor: 0.01 };
 const STAND: Hole = Hole { at: [0.52, -0.12], rim: 0.03, floor: 0.006 };
-/// Free space round the tube in the stand, m a side.
+/// Free space round the tube in the stand, m per side.
 const STAND_PLAY: f64 = 0.008;
 /// How far below the rack's rim the tube's bottom has to be, m.
 const INSERTED: f64 = 0.03;
@@ -34,7 +34,7 @@ const YAW: f64 = 0.5;
 
 /// The pair `test_tube`. Hard: a tube goes from a loose stand into a rack. Easy: it comes out and back into the stand.
 ///
-/// The tube's bottom is flat, so that it can stand by itself where there is room to lean. Default clearance 3 mm a side.
+/// The tube's bottom is flat, so that it can stand by itself where there is room to lean. Default clearance 3 mm per side.
 ///
 /// # Source
 /// A twin of the paper's real pair; sizes are ours.

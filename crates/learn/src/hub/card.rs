@@ -6,6 +6,7 @@ use crate::directory::io;
 use crate::record::{RunResults, parse_results};
 use crate::report::chart;
 use crate::{Error, Result};
+use e2h_core::Direction;
 use e2h_policy::{Checkpoint, Provenance};
 use std::path::Path;
 use toml::{Table, Value};
@@ -69,7 +70,7 @@ pub fn model_card(
 ) -> String {
     let p = provenance;
     let measured = results.and_then(|r| r.iterations.iter().find(|i| i.iteration == p.iteration));
-    let measured = measured.filter(|_| p.direction == "hard").map(|i| &i.evaluation);
+    let measured = measured.filter(|_| p.direction == Some(Direction::Hard)).map(|i| &i.evaluation);
     let mut card = "---\n".to_owned();
     if let Some(license) = license {
         card += &format!("license: {}\n", quoted(license));
@@ -91,7 +92,7 @@ pub fn model_card(
     card += &format!(
         "A diffusion policy for the {} task of `{}`, learned from time-reversed demonstrations of the task that undoes it \
          with Auto-E2H {}.\n\n",
-        plain(&p.direction),
+        p.direction.map_or("", Direction::name),
         plain(&p.task),
         plain(&p.version)
     );
@@ -107,7 +108,11 @@ pub fn model_card(
     card += "| iteration | successes | Wilson 95 % | minutes |\n|---|---|---|---|\n";
     for i in &results.iterations {
         let e = &i.evaluation;
-        let this = if i.iteration == p.iteration && p.direction == "hard" { " (this policy)" } else { "" };
+        let this = if i.iteration == p.iteration && p.direction == Some(Direction::Hard) {
+            " (this policy)"
+        } else {
+            ""
+        };
         card += &format!(
             "| {}{this} | {} of {} | {:.0} to {:.0} % | {:.1} |\n",
             i.iteration,
@@ -173,7 +178,7 @@ mod tests {
         let config = RunConfig::resolve("laptop", "nut_assembly", &set).unwrap().config;
         Provenance {
             task: "nut_assembly".to_owned(),
-            direction: "hard".to_owned(),
+            direction: Some(Direction::Hard),
             preset: "laptop".to_owned(),
             seed: 7,
             iteration: 2,

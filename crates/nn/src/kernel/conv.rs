@@ -1,4 +1,4 @@
-//! Convolutions as sums of matrix products, one a tap, over rows that are found through pointers: no patches are copied.
+//! Convolutions as sums of matrix products, one per tap, over rows that are found through pointers: no patches are copied.
 //!
 //! Weights lie in panels of columns ([`panel`]): `(n / width, taps, c, width)`. A product reads a panel from front to back,
 //! where rows a power of two apart would fall into the same few places of the caches.
@@ -72,7 +72,7 @@ struct Product<'a> {
     src_size: usize,
     size: usize,
     samples: usize,
-    /// Matrices `k` by `n`, one a tap, in panels.
+    /// Matrices `k` by `n`, one per tap, in panels.
     w: &'a [f32],
     taps: usize,
     k: usize,

@@ -344,7 +344,7 @@ fn table(
         if a.gripper.is_some() {
             state.push(segment.opening(t));
         }
-        #[allow(clippy::cast_possible_truncation, reason = "observation.state is 32 bits")]
+        // `observation.state` is 32 bits.
         for column in &further {
             let values = column.get(row).with_context(|| format!("row {row}"))?;
             state.extend(values.iter().map(|&v| v as f32));

@@ -22,9 +22,8 @@ pub(super) fn points(source: &Source, chosen: &[usize], megabytes: f64) -> usize
         (columns + 4).min(PLOTS * LINES)
     });
     let all = (lines * chosen.len()).max(1) as f64;
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 40 and 400")]
-    let points = (Films::room_for_plots(megabytes) / (all * POINT)).clamp(40.0, 400.0) as usize;
-    points
+    // Between 40 and 400.
+    (Films::room_for_plots(megabytes) / (all * POINT)).clamp(40.0, 400.0) as usize
 }
 
 /// The entries of a page, one episode after the other.
@@ -286,5 +285,5 @@ fn totals(fates: &[String]) -> String {
     for f in fates {
         *counts.entry(f.clone()).or_insert(0) += 1;
     }
-    fate::totals(&counts)
+    fate::totals(counts.iter().map(|(name, n)| (name.as_str(), *n)))
 }

@@ -63,11 +63,7 @@ impl Films {
             let cost = costs.map(cost).fold(0.0, f64::max) * 1.1;
             if cost > 0.0 {
                 let pictures = (options.megabytes * 1e6 * SHARE / cost).max(1.0);
-                #[allow(
-                    clippy::cast_possible_truncation,
-                    clippy::cast_sign_loss,
-                    reason = "positive, and small"
-                )]
+                // Positive, and small.
                 let stride = (rows as f64 / pictures).ceil() as usize;
                 this.stride = stride.max(1);
             }
@@ -103,7 +99,7 @@ impl Films {
             }
             frames.push(image);
         }
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 1 and 100")]
+        // Between 1 and 100.
         let fps = (recording.hz / self.stride as f64).round().clamp(1.0, 100.0) as u16;
         let thumbnail = |i: usize| -> Result<String> {
             let Some(camera) = recording.cameras.first() else { return Ok(String::new()) };

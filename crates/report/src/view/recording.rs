@@ -19,7 +19,7 @@ pub(super) struct Series {
 pub(super) enum Pictures {
     /// The pixels of each row.
     Raw(Vec<Arc<[u8]>>),
-    /// A PNG file a row.
+    /// A PNG file per row.
     Png(Vec<Vec<u8>>),
 }
 
@@ -128,7 +128,7 @@ pub(super) fn outcome_name(outcome: Outcome) -> &'static str {
     }
 }
 
-/// Speed of the step ahead, m/s; the last row has that of the step before. `position` has three entries a row.
+/// Speed of the step ahead, m/s; the last row has that of the step before. `position` has three entries per row.
 pub(super) fn speeds(position: &[[f64; 3]], hz: f64) -> Vec<f64> {
     let step = |w: &[[f64; 3]]| (0..3).map(|i| (w[1][i] - w[0][i]).powi(2)).sum::<f64>().sqrt() * hz;
     let mut speeds: Vec<f64> = position.windows(2).map(step).collect();

@@ -10,7 +10,7 @@ use crate::{Error, Result};
 use crate::{chart, svg::escape};
 use e2h_core::{CONTROL_HZ, one_line};
 use e2h_data::lerobot::Dataset;
-use e2h_refine::{KinematicConfig, ReverseConfig, kinematic_filter};
+use e2h_refine::{Fate, KinematicConfig, ReverseConfig, kinematic_filter};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -182,7 +182,7 @@ impl RunSource {
         let results = self.measured();
         let collections = || self.records.iter().filter_map(|r| r.collection.as_ref());
         let of: usize = collections().flat_map(|c| c.fates.values()).sum();
-        let kept: usize = collections().filter_map(|c| c.fates.get("kept")).sum();
+        let kept: usize = collections().filter_map(|c| c.fates.get(&Fate::Kept)).sum();
         let mut intro = String::new();
         if !results.iterations.is_empty() {
             intro += &figure("Success on the hard task", &chart::success_curve(&[&results]));

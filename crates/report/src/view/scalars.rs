@@ -5,6 +5,7 @@ use super::run::RunSource;
 use crate::Result;
 use crate::record::IterationRecord;
 use crate::tensorboard::Events;
+use e2h_refine::Fate;
 use std::path::Path;
 
 /// Writes the rows of a run's record; the number of values.
@@ -53,7 +54,7 @@ pub fn iteration(events: &mut Events, record: &IterationRecord, wall_time: f64) 
         values.extend(c.explored.rate().map(|r| ("collect/automatic_reset_rate_exploring", r)));
         values.extend(c.plain.rate().map(|r| ("collect/automatic_reset_rate_plain", r)));
         let of: usize = c.fates.values().sum();
-        values.push(("refine/kept_fraction", share(c.fates.get("kept").copied().unwrap_or(0), of)));
+        values.push(("refine/kept_fraction", share(c.fates.get(&Fate::Kept).copied().unwrap_or(0), of)));
         values.extend(c.critic_loss.map(|l| ("critic/validation_loss", l)));
     }
     for (tag, value) in &values {

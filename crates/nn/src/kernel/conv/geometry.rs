@@ -90,7 +90,7 @@ impl Class {
     }
 }
 
-#[allow(clippy::cast_possible_truncation, reason = "a sample has fewer than 2^32 numbers: `Geo::check`")]
+// A sample has fewer than 2^32 numbers: `Geo::check`.
 pub(super) fn narrow(x: usize) -> u32 {
     x as u32
 }

@@ -9,14 +9,17 @@
 
 use anyhow::{Context as _, bail};
 use auto_e2h::core::say;
-use auto_e2h::learn::record::RunResults;
-use auto_e2h::learn::report::{self, curve};
+use auto_e2h::report::record::RunResults;
+use auto_e2h::report::{self, curve};
 use clap::Parser;
 use std::path::{Path, PathBuf};
 
 /// Draws success against the number of easy demonstrations, before and after the loop.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Example:\n  cargo run --release --example curve -- checkpoints/curve/cube_pick_place"
+)]
 struct Arguments {
     /// Results of runs of one pair: JSON files, run directories, or folders of either.
     #[arg(required = true)]

@@ -13,7 +13,7 @@ use std::time::Instant;
 
 /// Replays a demonstration over and over and counts control steps.
 #[derive(Parser)]
-#[command(version)]
+#[command(version, after_help = "Example:\n  cargo run --release --example env_step -- --px 128 --json")]
 struct Arguments {
     /// Task pair.
     #[arg(long, default_value = "nut_assembly")]

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7
+//! cargo run --release --example evaluate -- --checkpoint checkpoints/cube_stack --video rollouts.png
 //! ```
 
 use anyhow::{Context as _, ensure};
@@ -13,7 +14,10 @@ use std::path::{Path, PathBuf};
 
 /// Runs a policy from fresh resets and counts successes.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example evaluate -- --checkpoint checkpoints/nut_assembly --trials 50 --seed 7\n  cargo run --release --example evaluate -- --checkpoint checkpoints/cube_stack --video rollouts.png"
+)]
 struct Arguments {
     /// Folder with policy.json and model.safetensors, or hf://OWNER/NAME[@revision] (feature `hub`).
     #[arg(long, value_name = "DIR")]
@@ -36,7 +40,7 @@ struct Arguments {
     /// Where the policy is computed: cpu, cuda or cuda:N.
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Threads (by default one a core); never changes a result.
+    /// Threads (by default one per core); never changes a result.
     #[arg(long)]
     threads: Option<usize>,
 }

@@ -1,12 +1,14 @@
 //! Is every task pair sound? Scripted demonstrators in both directions, reversed demonstrations replayed, policies that do
 //! not look, starts, contacts and speed.
 //!
-//!     cargo run --release --example experts -- --all --trials 100
+//! ```text
+//! cargo run --release --example experts -- --all --trials 100
+//! ```
 //!
 //! Successes, hard and easy: `experts`; `replay` of reversed easy demonstrations; `starts` in which both predicates are as they should
 //! be; policies that hold `still` or draw `random` goal poses. Then the deepest contact of anything with anything while goals are
 //! drawn every step (trembling) and every 20 steps (sweeping, with all the force that the arm has), and control steps a second
-//! with both cameras. About a minute a pair on two cores. `--json` prints one line a variant and nothing else.
+//! with both cameras. About a minute per pair on two cores. `--json` prints one line per variant and nothing else.
 
 use anyhow::Result;
 use clap::Parser;
@@ -19,7 +21,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 #[derive(Parser)]
-#[command(version)]
+#[command(version, after_help = "Example:\n  cargo run --release --example experts -- --all --trials 100")]
 struct Arguments {
     /// Task pair, with a variant after a colon if not the default one (nut_assembly:square).
     #[arg(long, default_value = "nut_assembly", conflicts_with = "all")]

@@ -16,7 +16,10 @@ use std::path::{Path, PathBuf};
 
 /// Converts diffusion policies to and from LeRobot 0.4.4.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example export -- --checkpoint runs/x/iteration_03/policy --lerobot published\n  cargo run --release --example export -- --from-lerobot downloaded --out checkpoint"
+)]
 struct Arguments {
     /// Our checkpoint: a folder with policy.json and model.safetensors.
     #[arg(long, value_name = "DIR", requires = "lerobot", conflicts_with_all = ["from_lerobot", "out"])]

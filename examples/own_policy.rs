@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example own_policy -- --preset smoke
+//! cargo run --release --example own_policy -- --seed 1 --set loop.cycles=20
 //! ```
 
 mod common;

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example own_task -- --preset smoke
+//! cargo run --release --example own_task -- --seed 1 --set loop.cycles=20
 //! ```
 //!
 //! A pair is a scene, a start and a goal for each direction, a scripted demonstrator, and a few lines of configuration.

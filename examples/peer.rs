@@ -18,7 +18,7 @@ use workload::{Size, Workload};
 
 /// Times a training step, a forward pass and sampling.
 #[derive(Parser)]
-#[command(version)]
+#[command(version, after_help = "Example:\n  cargo run --release --example peer -- --size laptop --json")]
 struct Arguments {
     /// Which network.
     #[arg(long, value_enum, default_value = "laptop")]

@@ -11,7 +11,10 @@ use std::path::PathBuf;
 
 /// Publishes a checkpoint folder as one commit.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Example:\n  HF_TOKEN=... cargo run --release --features hub --example publish -- --repo me/nut runs/nut_assembly-laptop-0/iteration_03/policy"
+)]
 struct Arguments {
     /// Folder with policy.json and model.safetensors; of a run, its results are published too.
     dir: PathBuf,

@@ -7,14 +7,17 @@
 
 use auto_e2h::core::say;
 use auto_e2h::data::lerobot::ColumnSlice;
-use auto_e2h::learn::view::{Options, VIEW_FILE, write, write_scalars};
+use auto_e2h::report::view::{Options, VIEW_FILE, write, write_scalars};
 use clap::Parser;
 use std::path::PathBuf;
 use std::time::UNIX_EPOCH;
 
 /// Writes an HTML page of every episode of a dataset or a run.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example view -- runs/nut_assembly-laptop-0\n  cargo run --release --example view -- recordings/unplug --out unplug.html --episodes 50"
+)]
 struct Arguments {
     /// A LeRobotDataset v3.0 or a run directory.
     dir: PathBuf,

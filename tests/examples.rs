@@ -25,10 +25,10 @@ fn nut_assembly_runs_from_nothing_and_its_checkpoint_evaluates() {
     assert!(last["collection"]["accepted"].as_u64().unwrap() > 0, "{last}");
     assert!(last["collection"]["critic_loss"].is_f64() && last["skipped"] == false, "{last}");
 
-    // The log has a folder a stage: every step's loss of the first, every iteration's success of the loop.
+    // The log has a folder per stage: every step's loss of the first, every iteration's success of the loop.
     let steps = |stage: &str, tag: &str| -> Vec<i64> {
         let files = std::fs::read_dir(out.join("tensorboard").join(stage)).unwrap().flatten();
-        let events = files.flat_map(|f| auto_e2h::learn::tensorboard::read(&f.path()).unwrap());
+        let events = files.flat_map(|f| auto_e2h::report::tensorboard::read(&f.path()).unwrap());
         let mut steps: Vec<i64> =
             events.filter(|e| e.scalars.iter().any(|s| s.0 == tag)).map(|e| e.step).collect();
         steps.sort_unstable();

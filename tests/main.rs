@@ -6,6 +6,7 @@ mod architecture; // the invariants of ARCHITECTURE.md that a program can check
 mod errors; // wrong input and trouble with files: a clear message, before any work, nothing lost
 mod examples; // every example binary with the smoke preset
 mod faults; // signals, closed pipes, flipped bits and a MuJoCo that cannot go on
+mod front_door; // what `cargo run` lists, and what every example says of itself
 mod pipeline; // refinement, critic and update on scripted rollouts
 mod resume; // kills at random instants, and thread counts: the same bytes
 

@@ -2,6 +2,7 @@ use auto_e2h::core::{Direction, Kind, Origin, stream};
 use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
 use auto_e2h::learn::{Accepted, Collected, Json, Run, RunOptions};
+use auto_e2h::refine::Fate;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -66,7 +67,7 @@ fn accepted_rollouts_are_refined_stored_and_learned_from() {
     assert_eq!((c.accepted, c.hard_successes), (3, 3));
     assert_eq!(c.fates.values().sum::<usize>(), frames, "every frame has one fate: {:?}", c.fates);
     assert_eq!(c.frames_kept, accepted.segments.iter().map(|s| s.len()).sum::<usize>());
-    assert!(c.fates["kept"] < frames && c.fates.contains_key("low_advantage"), "{:?}", c.fates);
+    assert!(c.fates[&Fate::Kept] < frames && c.fates.contains_key(&Fate::LowAdvantage), "{:?}", c.fates);
     assert!(c.critic_loss.is_some_and(f64::is_finite));
     assert!(matches!(&c.notes[..], [goals] if goals.starts_with("goals:")), "{:?}", c.notes);
     for segment in &accepted.segments {
@@ -91,7 +92,7 @@ fn without_a_hard_success_the_critic_is_skipped_and_without_rollouts_the_update(
     collected.hard.retain(|e| !e.outcome.is_success());
     let accepted = run.lesson(1, &base, &*hard, || Ok(collected)).unwrap();
     assert!(accepted.collection.notes.iter().any(|n| n.contains("no hard rollout succeeded")));
-    assert!(!accepted.collection.fates.contains_key("low_advantage"));
+    assert!(!accepted.collection.fates.contains_key(&Fate::LowAdvantage));
     assert!(!accepted.segments.is_empty());
 
     let none = [run.lesson(2, &base, &*hard, || Ok(Collected::default())).unwrap()];
@@ -118,13 +119,18 @@ fn every_method_makes_its_own_lesson_of_the_same_rollouts() {
         ["auto-e2h", "auto-e2h-literal", "no-kinematic", "no-critic", "direct-h"].map(lesson);
     let fates = |accepted: &Accepted| accepted.collection.fates.clone();
 
-    assert!(fates(&whole).contains_key("low_advantage") && fates(&whole).contains_key("static"));
+    assert!(fates(&whole).contains_key(&Fate::LowAdvantage) && fates(&whole).contains_key(&Fate::Static));
     // No gates: what they say is not in the notes, and pauses shorter than 16 frames stay.
     assert!(literal.collection.notes.iter().all(|n| n.contains("0 of") || !n.starts_with("suffix")));
-    assert!(fates(&literal).get("static") < fates(&whole).get("static"));
-    assert!(!fates(&no_kinematic).contains_key("static") && !fates(&no_kinematic).contains_key("retimed"));
-    assert!(fates(&no_kinematic).contains_key("low_advantage"));
-    assert!(!fates(&no_critic).contains_key("low_advantage") && no_critic.collection.critic_loss.is_none());
+    assert!(fates(&literal).get(&Fate::Static) < fates(&whole).get(&Fate::Static));
+    assert!(
+        !fates(&no_kinematic).contains_key(&Fate::Static)
+            && !fates(&no_kinematic).contains_key(&Fate::Resampled)
+    );
+    assert!(fates(&no_kinematic).contains_key(&Fate::LowAdvantage));
+    assert!(
+        !fates(&no_critic).contains_key(&Fate::LowAdvantage) && no_critic.collection.critic_loss.is_none()
+    );
     // Hard successes, forwards, each with its own labels.
     assert_eq!((direct.collection.accepted, direct.collection.hard_successes), (3, 3));
     for segment in &direct.segments {

@@ -6,3 +6,4 @@ pub use e2h_learn as learn;
 pub use e2h_nn as nn;
 pub use e2h_policy as policy;
 pub use e2h_refine as refine;
+pub use e2h_report as report;

@@ -1,6 +1,9 @@
 //! Puts the pinned MuJoCo library into `OUT_DIR/lib` and tells dependents where it is. A directory inside `target/`,
 //! because cargo puts only those on the library path of `cargo run` and `cargo test`.
 
+#[path = "src/cache.rs"]
+#[allow(unreachable_pub, reason = "public in the crate, which shares it")]
+mod cache;
 #[path = "src/obtain.rs"]
 mod obtain;
 
@@ -12,7 +15,7 @@ fn main() {
     for name in obtain::VARIABLES {
         println!("cargo::rerun-if-env-changed={name}");
     }
-    for path in ["build.rs", "src/obtain.rs", "stub"] {
+    for path in ["build.rs", "src/cache.rs", "src/obtain.rs", "stub"] {
         println!("cargo::rerun-if-changed={path}");
     }
     if env::var_os("DOCS_RS").is_some() {

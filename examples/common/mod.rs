@@ -4,7 +4,7 @@ use auto_e2h::core::{Failure, mention, say};
 pub(crate) use auto_e2h::learn::Run;
 use auto_e2h::learn::record::RunResults;
 use auto_e2h::learn::{Error, Parts, Result, RunOptions, Stop, report};
-use clap::{Parser, ValueEnum};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser, ValueEnum};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -68,7 +68,7 @@ struct Arguments {
     /// Override a value of the configuration, for example loop.cycles=20 (may be repeated).
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Threads (by default one a core); never changes a result.
+    /// Threads (by default one per core); never changes a result.
     #[arg(long)]
     threads: Option<usize>,
     /// Show no progress.
@@ -81,7 +81,12 @@ struct Arguments {
 
 /// What the command line asks for.
 fn options(task: &str) -> Result<RunOptions> {
-    let a = Arguments::parse();
+    let example = env!("CARGO_BIN_NAME");
+    let command = Arguments::command().after_help(format!(
+        "Examples:\n  cargo run --release --example {example} -- --preset smoke\n  cargo run --release --example {example} -- \
+         --seed 1 --set loop.cycles=20"
+    ));
+    let a = Arguments::from_arg_matches(&command.get_matches()).unwrap_or_else(|e| e.exit());
     let preset = match a.preset {
         Preset::Smoke => "smoke",
         Preset::Laptop => "laptop",

@@ -1,3 +1,4 @@
+use crate::state::{EEF, OPENING};
 use crate::{ACTION_DIM, Error, Pose, Result, STATE_DIM};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -52,7 +53,7 @@ impl std::fmt::Display for Direction {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The success predicate held long enough; `at` is the row at which it first held of the run that ended the episode.
+    /// The success predicate held long enough; `at` is the first row of the final, successful streak.
     Success {
         /// Row index.
         at: usize,
@@ -120,7 +121,7 @@ impl Origin {
     }
 }
 
-/// One camera image. Shapes: `data` is (height, width, 3), row-major, 8 bits a channel.
+/// One camera image. Shapes: `data` is (height, width, 3), row-major, 8 bits per channel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
     /// Rows.
@@ -136,17 +137,17 @@ pub struct Image {
 pub struct Observation {
     /// Low-dimensional state.
     pub state: State,
-    /// One image a camera, in the order of the environment's camera names.
+    /// One image per camera, in the order of the environment's camera names.
     pub frames: Vec<Image>,
 }
 
-/// The images of one camera over an episode, one a row.
+/// The images of one camera over an episode, one per row.
 ///
 /// An image is shared by all episodes that show it: cloning an episode or selecting rows of it copies no pixel, and an image
 /// is freed with the last episode that shows it.
 ///
 /// # Shapes
-/// `images` (T), each (height, width, 3), row-major, 8 bits a channel.
+/// `images` (T), each (height, width, 3), row-major, 8 bits per channel.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Frames {
     /// Camera name.
@@ -190,7 +191,7 @@ impl Frames {
 /// One recorded episode, by column; row t of every column is one control step.
 ///
 /// # Shapes
-/// `state` (T, 15), `action` (T, 8), `frames` one entry a camera (T, H, W, 3), `source` (T), `excursion` (T, 4).
+/// `state` (T, 15), `action` (T, 8), `frames` one entry per camera (T, H, W, 3), `source` (T), `excursion` (T, 4).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
     /// State before the action of the same row.
@@ -262,7 +263,7 @@ impl Episode {
             }
             column.images.push(image.data.as_slice().into());
         }
-        #[allow(clippy::cast_possible_truncation, reason = "episodes are far shorter than 2^32 rows")]
+        // Episodes are far shorter than 2^32 rows.
         self.source.push(self.state.len() as u32);
         self.state.push(observation.state);
         self.action.push(*action);
@@ -299,13 +300,13 @@ impl Episode {
     /// Pose of the tool centre point in row `t`.
     #[must_use]
     pub fn eef(&self, t: usize) -> Pose {
-        Pose::from_row(&self.state[t][..7])
+        Pose::from_row(&self.state[t][EEF])
     }
 
     /// Gripper opening in row `t`, m.
     #[must_use]
     pub fn opening(&self, t: usize) -> f32 {
-        self.state[t][STATE_DIM - 1]
+        self.state[t][OPENING]
     }
 
     /// Checks that columns agree in length, images have the size of their camera and all numbers are finite.

@@ -19,6 +19,7 @@ mod pose;
 mod random;
 mod say;
 mod spelling;
+pub mod state;
 mod traits;
 
 pub use episode::{
@@ -26,10 +27,10 @@ pub use episode::{
 };
 pub use failure::Failure;
 pub use pose::{Pose, align_hemisphere, continue_signs};
-pub use random::{Rng, stream};
+pub use random::{Rng, fnv1a, stream};
 pub use say::{mention, say};
 pub use spelling::{nearest, one_line};
-pub use traits::{ActionChunk, Policy, Value};
+pub use traits::{ActionChunk, Policy};
 
 /// Entries of a state row: eef position 3, eef quaternion 4, object position 3, object quaternion 4, gripper opening 1.
 pub const STATE_DIM: usize = 15;

@@ -28,10 +28,7 @@ impl Pose {
 
     /// Seven numbers: position, quaternion wxyz in the hemisphere of `reference` (wxyz).
     #[must_use]
-    #[allow(
-        clippy::cast_possible_truncation,
-        reason = "stored episodes are f32; physics is f64: this is the one place"
-    )]
+    // Stored episodes are f32; physics is f64: this is the one place.
     pub fn to_row(&self, reference: &[f64; 4]) -> [f32; 7] {
         let q = self.orientation.quaternion();
         let q = align_hemisphere([q.w, q.i, q.j, q.k], reference);

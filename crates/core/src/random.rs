@@ -7,18 +7,26 @@ pub type Rng = rand_chacha::ChaCha8Rng;
 /// results do not depend on how many of those ran.
 ///
 /// # Source
-/// The four values are the key of the ChaCha cipher itself, so that no hash can make two streams meet; `purpose` enters as
-/// its 64-bit FNV-1a hash.
+/// The four values are the key of the ChaCha cipher itself. Seed, iteration and index enter as they are and never make two
+/// streams meet; `purpose` enters as its 64-bit FNV-1a hash, so two purposes meet only where their hashes do.
 #[must_use]
 pub fn stream(seed: u64, purpose: &str, iteration: u64, index: u64) -> Rng {
-    let purpose = purpose
-        .bytes()
-        .fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
     let mut key = [0; 32];
-    for (chunk, value) in key.chunks_exact_mut(8).zip([seed, purpose, iteration, index]) {
+    for (chunk, value) in key.chunks_exact_mut(8).zip([seed, fnv1a(purpose.bytes()), iteration, index]) {
         chunk.copy_from_slice(&value.to_le_bytes());
     }
     Rng::from_seed(key)
+}
+
+/// The 64-bit FNV-1a hash: the same on every machine and in every version.
+///
+/// ```
+/// assert_eq!(e2h_core::fnv1a(*b"foobar"), 0x8594_4171_f739_67e8);
+/// ```
+#[must_use]
+pub fn fnv1a(bytes: impl IntoIterator<Item = u8>) -> u64 {
+    let mix = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);
+    bytes.into_iter().fold(0xcbf2_9ce4_8422_2325, mix)
 }
 
 #[cfg(test)]

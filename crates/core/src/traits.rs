@@ -1,6 +1,6 @@
-use crate::{Action, Episode, Observation, Result, Rng};
+use crate::{Action, Observation, Result, Rng};
 
-/// The actions that a policy wants executed next, one a control step.
+/// The actions that a policy wants executed next, one per control step.
 pub type ActionChunk = Vec<Action>;
 
 /// Something that acts. Batched, because several environments ask at once.
@@ -12,18 +12,9 @@ pub trait Policy: Sync {
     ///
     /// # Shapes
     /// `histories` (B, To), oldest first; at the start of an episode the first observation is repeated. `rngs` (B): one
-    /// stream an environment, so that what one environment gets does not depend on which others ask with it.
+    /// stream per environment, so that what one environment gets does not depend on which others ask with it.
     ///
     /// # Errors
     /// When the observations do not fit the policy, or the network fails.
     fn act(&self, histories: &[Vec<&Observation>], rngs: &mut [Rng]) -> Result<Vec<ActionChunk>>;
-}
-
-/// Something that says how far along every row of an episode is.
-pub trait Value: Sync {
-    /// Values. Shapes: (T).
-    ///
-    /// # Errors
-    /// When the episode does not fit the critic, or the network fails.
-    fn values(&self, episode: &Episode) -> Result<Vec<f32>>;
 }

@@ -17,7 +17,10 @@ use std::process::ExitCode;
 
 /// LeRobot datasets.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example dataset -- check recordings/unplug\n  cargo run --release --example dataset -- check recordings/unplug --repair"
+)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,

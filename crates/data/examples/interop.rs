@@ -6,7 +6,9 @@
 //! cargo run --release -p e2h-data --example interop -- dump DIR
 //! cargo run --release -p e2h-data --example interop -- images DIR OUT
 //! ```
-use anyhow::{Context, Result, bail};
+
+use anyhow::{Context, Result};
+use clap::Parser;
 use e2h_core::{Direction, Episode, Frames, Observation, Origin, Outcome, say};
 use e2h_data::lerobot::{Column, Dataset, Writer, features_of};
 use serde_json::{Value, json};
@@ -15,21 +17,26 @@ use sha2::{Digest, Sha256};
 /// Rows of the episodes that `write` makes: one that is sampled, short ones, a single row.
 const ROWS: [usize; 5] = [130, 7, 1, 12, 30];
 
+/// Our side of the checks against LeRobot.
+#[derive(Parser)]
+#[command(version, after_help = "Example:\n  cargo run --release -p e2h-data --example interop -- dump DIR")]
+enum Arguments {
+    /// Writes a dataset of our episodes.
+    Write { dir: String },
+    /// Appends an episode to a dataset.
+    Append { dir: String },
+    /// Prints what is read of a dataset, as JSON.
+    Dump { dir: String },
+    /// Writes the pixels of a dataset's images to a file.
+    Images { dir: String, out: String },
+}
+
 fn main() -> Result<()> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    if let [command, dir, out] = &arguments[..]
-        && command == "images"
-    {
-        return images(dir, out);
-    }
-    let [command, dir] = &arguments[..] else {
-        bail!("usage: interop write|append|dump DIR, or images DIR OUT")
-    };
-    match command.as_str() {
-        "write" => write(dir),
-        "append" => append(dir),
-        "dump" => dump(dir),
-        other => bail!("expected write, append or dump, got `{other}`"),
+    match Arguments::parse() {
+        Arguments::Write { dir } => write(&dir),
+        Arguments::Append { dir } => append(&dir),
+        Arguments::Dump { dir } => dump(&dir),
+        Arguments::Images { dir, out } => images(&dir, &out),
     }
 }
 
@@ -82,7 +89,7 @@ fn append(dir: &str) -> Result<()> {
     Ok(say(format_args!("appended: {} episodes, {} frames", info.total_episodes, info.total_frames))?)
 }
 
-/// Every number, and the SHA-256 of every image's pixels, one JSON line an episode.
+/// Every number, and the SHA-256 of every image's pixels, one JSON line per episode.
 fn dump(dir: &str) -> Result<()> {
     let dataset = Dataset::open(dir)?;
     for i in 0..dataset.len() {
@@ -105,7 +112,7 @@ fn dump(dir: &str) -> Result<()> {
     Ok(())
 }
 
-/// The first camera's frames as files, a folder an episode.
+/// The first camera's frames as files, a folder per episode.
 fn images(dir: &str, out: &str) -> Result<()> {
     let dataset = Dataset::open(dir)?;
     let camera = dataset.info().features.iter().find(|(_, f)| f.is_visual()).context("a camera")?.0.clone();

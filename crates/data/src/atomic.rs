@@ -18,9 +18,9 @@ pub(crate) fn io(action: &'static str, path: &Path) -> impl Fn(std::io::Error) -
 pub(crate) fn unfinished(folder: &Path) -> Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(UNFINISHED);
-    // Temporary files are private by default; data is as readable as any file of its user.
+    // Temporary files are private by default; a result is as readable as the user's other files.
     #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o644));
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
     builder.tempfile_in(folder).map_err(io("write in", folder))
 }
 
@@ -30,7 +30,12 @@ pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<()> {
     #[cfg(test)]
     fuse::burn(path)?;
     file.persist(path).map_err(|e| io("replace", path)(e.error))?;
-    sync(path.parent().unwrap_or(Path::new(".")))
+    sync(folder_of(path))
+}
+
+/// The folder that a file is in; a bare name is in the current one.
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Writes or replaces a file, and makes its folder where it is not there. At any instant the old file or the new one is
@@ -39,17 +44,23 @@ pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<()> {
 /// # Errors
 /// When the file system refuses; the file is then what it was.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    let folder = path.parent().unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     make_folder(folder)?;
     let mut file = unfinished(folder)?;
     file.write_all(bytes).map_err(io("write", path))?;
     persist(file, path)
 }
 
-/// A rename is safe only once its folder is.
+/// A rename is safe only once its folder is. Where the file system cannot sync a folder, that is all that can be done.
 pub(crate) fn sync(folder: &Path) -> Result<()> {
+    use std::io::ErrorKind::{InvalidInput, Unsupported};
     #[cfg(unix)]
-    File::open(folder).and_then(|f| f.sync_all()).map_err(io("sync the folder", folder))?;
+    match File::open(folder).and_then(|f| f.sync_all()) {
+        Err(e) if !matches!(e.kind(), InvalidInput | Unsupported) => {
+            return Err(io("sync the folder", folder)(e));
+        }
+        _ => {}
+    }
     Ok(())
 }
 
@@ -62,7 +73,7 @@ pub(crate) fn make_folder(folder: &Path) -> Result<()> {
             Err(e) if e.kind() != std::io::ErrorKind::AlreadyExists => {
                 return Err(io("make the folder", folder)(e));
             }
-            _ => sync(folder.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new(".")))?,
+            _ => sync(folder_of(folder))?,
         }
     }
     Ok(())

@@ -26,12 +26,6 @@ pub enum Error {
         /// What is there.
         found: String,
     },
-    /// A name that could leave the folder or collide with temporary files.
-    #[error("episode name: expected letters, digits, `_`, `-` and inner `.`, found `{found}`")]
-    Name {
-        /// The name.
-        found: String,
-    },
     /// The episode contradicts itself.
     #[error("episode `{name}`: {source}")]
     Episode {
@@ -39,12 +33,6 @@ pub enum Error {
         name: String,
         /// What is wrong.
         source: e2h_core::Error,
-    },
-    /// Several files of a store are not what they should be.
-    #[error("{} file(s) cannot be used:\n{}", problems.len(), problems.join("\n"))]
-    Store {
-        /// One line a file.
-        problems: Vec<String>,
     },
     /// Ranges cannot be taken from nothing.
     #[error("normaliser: expected episodes with rows, found none")]
@@ -68,16 +56,6 @@ pub enum Error {
         expected: usize,
         /// Numbers given.
         found: usize,
-    },
-    /// A crop does not fit into its image.
-    #[error("crop: expected at most the image, {height} x {width}, found {size} x {size}")]
-    Crop {
-        /// Rows of the image.
-        height: usize,
-        /// Columns of the image.
-        width: usize,
-        /// Side of the crop.
-        size: usize,
     },
     /// A table does not fit the features of its dataset.
     #[error("column `{column}`: expected {expected}, found {found}")]

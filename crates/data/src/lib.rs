@@ -5,16 +5,19 @@
 //!
 //! ```
 //! use e2h_core::{Direction, Episode, Observation, Origin};
-//! use e2h_data::{EpisodeStore, Normaliser, NormaliserConfig, WindowConfig, Windows};
+//! use e2h_data::lerobot::{Dataset, Writer, features_of};
+//! use e2h_data::{Normaliser, NormaliserConfig, WindowConfig, Windows};
 //!
 //! let mut episode = Episode::new(Origin::demonstration("nut_assembly", Direction::Easy, 0, 42), &[]);
 //! for t in 0..20 {
 //!     episode.push(&Observation { state: [t as f32; 15], frames: vec![] }, &[t as f32; 8])?;
 //! }
 //! let folder = tempfile::tempdir()?;
-//! let store = EpisodeStore::open(folder.path())?;
-//! store.write("easy_000", &episode)?;
-//! let episodes = vec![store.read("easy_000")?];
+//! let root = folder.path().join("easy");
+//! let mut writer = Writer::create(&root, 20.0, Some("panda"), features_of(&episode))?;
+//! writer.push_episode(&episode)?;
+//! writer.finish()?;
+//! let episodes = vec![Dataset::open(&root)?.read_episode(0)?];
 //!
 //! let normaliser = Normaliser::fit(&episodes, &NormaliserConfig::default())?;
 //! assert_eq!(normaliser.normalise_state(&episodes[0].state[19])[0], 1.0);
@@ -27,7 +30,6 @@
 //! ```
 
 mod atomic;
-mod crop;
 mod error;
 mod file;
 #[cfg(test)]
@@ -36,15 +38,12 @@ pub mod lerobot;
 mod normalise;
 mod resize;
 mod sample;
-mod store;
 mod window;
 
 pub use atomic::write as write_atomic;
-pub use crop::Crop;
 pub use error::{Error, Result};
 pub use file::read_regular;
 pub use normalise::{Normaliser, NormaliserConfig};
 pub use resize::resize_image;
 pub use sample::{Pick, Sampler, Source};
-pub use store::{EpisodeStore, Summary};
 pub use window::{Alignment, Window, WindowConfig, Windows};

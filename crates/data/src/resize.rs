@@ -33,7 +33,7 @@ pub fn resize_image(image: &Image, height: usize, width: usize) -> Result<Image>
                     }
                 }
             }
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a mean of bytes")]
+            // A mean of bytes.
             data.extend(sum.map(|v| v.round() as u8));
         }
     }

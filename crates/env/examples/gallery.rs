@@ -14,9 +14,12 @@ use std::path::{Path, PathBuf};
 
 /// Draws every task pair.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Examples:\n  cargo run --release --example gallery\n  cargo run --release --example gallery -- --out crates/env/pictures"
+)]
 struct Arguments {
-    /// Folder for one PNG a pair.
+    /// Folder for one PNG per pair.
     #[arg(long, value_name = "DIR", default_value = "runs/gallery")]
     out: PathBuf,
     /// One pair instead of all.
@@ -63,7 +66,7 @@ fn program() -> Result<()> {
     Ok(())
 }
 
-/// Pictures of a demonstration: one column a moment, one row a camera.
+/// Pictures of a demonstration: one column per moment, one row per camera.
 fn draw(name: &str, size: usize, seed: u64) -> Result<Vec<[Image; 2]>> {
     let task = task(name, &TaskOptions::default())?;
     let mut env = Env::new(task.clone(), &EnvConfig::physics(&*task))?;

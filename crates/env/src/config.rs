@@ -59,7 +59,7 @@ impl EnvConfig {
 
 /// Longest episode, control steps: a quarter of an hour.
 const MOST_STEPS: usize = 20_000;
-/// Largest image of an observation, pixels a side: every step of every episode keeps its images.
+/// Largest image of an observation, pixels per side: every step of every episode keeps its images.
 const MOST_SIDE: usize = 1024;
 
 fn whole(problems: &mut Vec<String>, name: &str, value: usize, [least, most]: [usize; 2]) {
@@ -141,7 +141,7 @@ impl DemonstratorConfig {
 pub struct TaskOptions {
     /// Name of the variant; empty for the task's default.
     pub variant: String,
-    /// Free space between the object and the hole or holder that it goes into, m a side; 0 for the task's default.
+    /// Free space between the object and the hole or holder that it goes into, m per side; 0 for the task's default.
     pub clearance: f64,
     /// The scripted demonstrator.
     pub demonstrator: DemonstratorConfig,

@@ -2,6 +2,7 @@ use crate::arm::JOINTS;
 use crate::expert::gauss;
 use crate::render::Renderer;
 use crate::{EnvConfig, Error, Result, Sim, Style, Task, logging};
+use e2h_core::state::{self, EEF, OBJECT};
 use e2h_core::{Action, Direction, Image, Observation, Outcome, Pose, Rng, State, align_hemisphere};
 use mujoco_rs::prelude::MjModel;
 use std::sync::Arc;
@@ -23,6 +24,26 @@ pub struct Env {
     sim: Sim,
     renderer: Renderer,
     episode: Progress,
+}
+
+/// The whole state of an environment at one instant, to come back to.
+///
+/// As numbers it can be kept in a file; what each of them means is the environment's own affair, and may change with the version.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot(Vec<f64>);
+
+impl Snapshot {
+    /// Its numbers.
+    #[must_use]
+    pub fn numbers(&self) -> &[f64] {
+        &self.0
+    }
+}
+
+impl From<Vec<f64>> for Snapshot {
+    fn from(numbers: Vec<f64>) -> Self {
+        Self(numbers)
+    }
 }
 
 /// Where an episode stands.
@@ -214,14 +235,14 @@ impl Env {
     /// The low-dimensional state: tool centre point, object, distance between the fingers (0 to 0.08 m).
     #[must_use]
     pub fn state(&self) -> State {
-        let mut state = State::default();
+        let mut row = State::default();
         let [eef, object] = &self.episode.signs;
-        state[..7].copy_from_slice(&self.sim.tcp().to_row(eef));
-        state[7..14].copy_from_slice(&self.sim.object().to_row(object));
-        #[allow(clippy::cast_possible_truncation, reason = "recorded states are f32")]
+        row[EEF].copy_from_slice(&self.sim.tcp().to_row(eef));
+        row[OBJECT].copy_from_slice(&self.sim.object().to_row(object));
+        // Recorded states are f32.
         let opening = self.sim.opening() as f32;
-        state[14] = opening;
-        state
+        row[state::OPENING] = opening;
+        row
     }
 
     /// One control step. The outcome is there when the episode ended with it: success held for
@@ -281,20 +302,21 @@ impl Env {
 
     /// The whole state, physics, controller and counters: [`Self::restore`] continues from it bit for bit.
     #[must_use]
-    pub fn save(&self) -> Vec<f64> {
+    pub fn save(&self) -> Snapshot {
         let mut state = self.sim.save();
         let Progress { direction, steps, held, signs } = self.episode;
         state.extend([f64::from(u8::from(direction == Direction::Easy)), steps as f64, held as f64]);
         state.extend(signs.as_flattened());
-        state
+        Snapshot(state)
     }
 
     /// Back to a state of [`Self::save`], of this or another environment of the same task.
     ///
     /// # Errors
-    /// When the length does not fit.
-    pub fn restore(&mut self, state: &[f64]) -> Result<()> {
-        let expected = self.save().len();
+    /// When it is not of this task.
+    pub fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let state = &snapshot.0[..];
+        let expected = self.save().0.len();
         if state.len() != expected {
             return Err(Error::State { expected, found: state.len() });
         }
@@ -303,7 +325,7 @@ impl Env {
         };
         let signs = signs.to_vec(); // eight numbers: the length was checked
         let direction = if easy > 0.5 { Direction::Easy } else { Direction::Hard };
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saved from usize")]
+        // Saved from usize.
         let (steps, held) = (steps as usize, held as usize);
         let quaternion = |i: usize| std::array::from_fn(|k| signs[4 * i + k]);
         self.episode = Progress { direction, steps, held, signs: [quaternion(0), quaternion(1)] };

@@ -35,14 +35,14 @@ mod tasks;
 
 pub use arm::PosturePull;
 pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
-pub use env::{CAMERAS, Env};
+pub use env::{CAMERAS, Env, Snapshot};
 pub use expert::{Expert, Phase, Script};
 pub use probe::{Blind, Probed, probe};
 pub use record::{demonstrate, replay};
 pub use render::{MOST_PIXELS, Style};
 pub use scene::{TableCamera, compose, finer};
 pub use sim::{MAX_OPENING, Sim};
-pub use task::{Task, registry, task, variants};
+pub use task::Task;
 pub use tasks::*;
 
 /// What pick-and-place pairs are made of: regions and pieces of predicates, grasps, and the one script of their demonstrators.
@@ -108,7 +108,7 @@ pub enum Error {
         task: &'static str,
         /// What it can be.
         expected: String,
-        /// What was asked for, m a side.
+        /// What was asked for, m per side.
         found: f64,
     },
     /// An action that no controller can follow.
@@ -138,6 +138,12 @@ pub enum Error {
     /// A recording does not fit together.
     #[error(transparent)]
     Core(#[from] e2h_core::Error),
+}
+
+/// Version of the MuJoCo library that this process has loaded.
+#[must_use]
+pub fn mujoco_version() -> &'static str {
+    mujoco_rs::mujoco_version()
 }
 
 fn guess(nearest: &str) -> String {

@@ -28,7 +28,7 @@ impl Region {
         Vector3::new(draw(rng, self.x), draw(rng, self.y), height)
     }
 
-    /// The point nearest to `p`, on the level, that is over the region or within three quarters of [`MARGIN`]: what is put
+    /// The point nearest to `p`, on the level, that is over the region or within three quarters of 2 cm: what is put
     /// down there still counts when the hand pushes it a little as it lets go.
     #[must_use]
     pub fn nearest(&self, p: &Vector3<f64>) -> Vector3<f64> {
@@ -36,7 +36,7 @@ impl Region {
         Vector3::new(nearest(p.x, self.x), nearest(p.y, self.y), p.z)
     }
 
-    /// Whether a point is over the region or within [`MARGIN`] of it.
+    /// Whether a point is over the region or within 2 cm of it.
     #[must_use]
     pub fn contains(&self, p: &Vector3<f64>) -> bool {
         let within = |v: f64, [low, high]: [f64; 2]| (low - MARGIN..=high + MARGIN).contains(&v);

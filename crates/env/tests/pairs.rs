@@ -113,7 +113,7 @@ fn a_restored_state_continues_bit_for_bit() {
         let mut other = env.clone_shared().unwrap();
         other.restore(&saved).unwrap();
         assert_eq!(run(&mut other), first);
-        assert!(matches!(other.restore(&saved[1..]), Err(Error::State { .. })));
+        assert!(matches!(other.restore(&saved.numbers()[1..].to_vec().into()), Err(Error::State { .. })));
     });
 }
 
@@ -308,9 +308,9 @@ fn a_moving_goal_is_followed_within_one_control_step() {
 fn a_diverged_simulation_ends_the_episode_and_a_reset_repairs_it() {
     let mut env = nut();
     env.reset(Direction::Hard, &mut rng("diverge", 0)).unwrap();
-    let mut state = env.save();
+    let mut state = env.save().numbers().to_vec();
     state[1 + 16] = 1e12; // time, then 16 positions, then the first joint's velocity
-    env.restore(&state).unwrap();
+    env.restore(&state.into()).unwrap();
     let action = stay(&env);
     assert_eq!(env.step(&action).unwrap(), Some(Outcome::Diverged));
     env.reset(Direction::Hard, &mut rng("diverge", 0)).unwrap();

@@ -2,7 +2,7 @@
 
 use crate::config::{AfterFailure, LoopConfig};
 use crate::explore::Wander;
-use crate::record::Automatic;
+use crate::record::{Automatic, ResetCause};
 use crate::rollout::{self, Finished, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Episode, Kind, Origin, Outcome, Policy, stream};
@@ -23,7 +23,7 @@ pub struct Collected {
     /// Easy rollouts that succeeded.
     pub easy_successes: usize,
     /// External resets by cause.
-    pub resets: BTreeMap<String, usize>,
+    pub resets: BTreeMap<ResetCause, usize>,
     /// Cycles with exploration.
     pub explored: Automatic,
     /// Cycles without.
@@ -86,17 +86,17 @@ pub fn collect(
         lane.rollout = Some(rollout.wandering(wander));
         Ok(())
     };
-    let reset = |lane: &mut Lane<Loop>, direction: Direction, cause: &str| -> Result<()> {
+    let reset = |lane: &mut Lane<Loop>, direction: Direction, cause: ResetCause| -> Result<()> {
         let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
         let purpose = if direction == Direction::Hard { "collect/reset/hard" } else { "collect/reset/easy" };
-        let mut count = |cause: &str, n| {
+        let mut count = |cause: ResetCause, n| {
             if n > 0 {
-                *lane.state.collected.resets.entry(cause.to_owned()).or_default() += n;
+                *lane.state.collected.resets.entry(cause).or_default() += n;
             }
         };
         count(cause, 1);
         count(
-            "reset_diverged",
+            ResetCause::ResetDiverged,
             rollout::reset(&mut lane.env, direction, seed, purpose, iteration, cycle as u64)?,
         );
         Ok(())
@@ -104,7 +104,9 @@ pub fn collect(
     // Home without a reset; false: the way there diverged, which a reset has repaired.
     let home = |lane: &mut Lane<Loop>, direction: Direction| -> Result<bool> {
         match lane.env.home() {
-            Err(e2h_env::Error::Diverged(_)) => reset(lane, direction, "homing_diverged").map(|()| false),
+            Err(e2h_env::Error::Diverged(_)) => {
+                reset(lane, direction, ResetCause::HomingDiverged).map(|()| false)
+            }
             done => Ok(done.map(|()| true)?),
         }
     };
@@ -113,8 +115,8 @@ pub fn collect(
         let success = finished.outcome.is_success();
         // What only an external reset repairs.
         let accident = match finished.outcome {
-            Outcome::Diverged => Some("diverged"),
-            Outcome::Dropped => Some("dropped"),
+            Outcome::Diverged => Some(ResetCause::Diverged),
+            Outcome::Dropped => Some(ResetCause::Dropped),
             Outcome::Success { .. } | Outcome::Timeout => None,
         };
         match direction {
@@ -123,7 +125,7 @@ pub fn collect(
                 let Some(&cycle) = lane.state.cycles.front() else { return Ok(()) };
                 let cause = match (success, accident, config.after_failure) {
                     (_, Some(cause), _) => Some(cause),
-                    (false, _, AfterFailure::Assembled) => Some("hard_failed"),
+                    (false, _, AfterFailure::Assembled) => Some(ResetCause::HardFailed),
                     _ => None,
                 };
                 let by_itself = match cause {
@@ -157,7 +159,7 @@ pub fn collect(
                 }
                 let by_itself = match (success, accident) {
                     (_, Some(cause)) => reset(lane, Direction::Hard, cause).map(|()| false)?,
-                    (false, _) => reset(lane, Direction::Hard, "easy_failed").map(|()| false)?,
+                    (false, _) => reset(lane, Direction::Hard, ResetCause::EasyFailed).map(|()| false)?,
                     (true, _) => !config.homing || home(lane, Direction::Hard)?,
                 };
                 if let Some(cycle) = done.filter(|_| success && !by_itself) {
@@ -183,7 +185,7 @@ pub fn collect(
         .collect();
     for lane in &mut lanes {
         if !lane.state.cycles.is_empty() {
-            reset(lane, Direction::Hard, "start")?;
+            reset(lane, Direction::Hard, ResetCause::Start)?;
             begin(lane, Direction::Hard)?;
         }
     }

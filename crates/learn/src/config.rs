@@ -17,23 +17,6 @@ const PRESETS: [(&str, &str); 3] = [
     ("paper", include_str!("../../../configs/presets/paper.toml")),
 ];
 
-macro_rules! task_files {
-    ($($name:literal),*) => { [$(($name, include_str!(concat!("../../../configs/tasks/", $name, ".toml")))),*] };
-}
-
-const TASKS: [(&str, &str); 10] = task_files![
-    "cube_pick_place",
-    "cylinder_pick_place",
-    "cube_stack",
-    "rod_insertion",
-    "nut_assembly",
-    "peg_insertion",
-    "disk",
-    "mouse",
-    "test_tube",
-    "brush"
-];
-
 /// Everything that a run depends on besides its seed. Each preset file states every entry; see there for the reasons.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -241,7 +224,7 @@ impl RunConfig {
         overrides: &[String],
     ) -> Result<Resolved> {
         let mut table = parse(preset, find("preset", preset, &PRESETS)?)?;
-        let of_task = parse(task, own.map_or_else(|| find("task", task, &TASKS), Ok)?)?;
+        let of_task = parse(task, own.map_or_else(|| of_registry(task), Ok)?)?;
         // A task file has entries for all presets, and may have some for one alone.
         let mut common = of_task.clone();
         let special = common.remove("preset");
@@ -310,6 +293,13 @@ impl RunConfig {
         config.validate()?;
         Ok(Resolved { preset: preset.to_owned(), config, text })
     }
+}
+
+/// Text of a built-in pair's configuration file.
+fn of_registry(task: &str) -> Result<&'static str> {
+    e2h_env::configuration(task).ok_or_else(|| {
+        Error::Config(format!("unknown task `{task}`; {}", suggestion(task, "", e2h_env::registry())))
+    })
 }
 
 fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str> {
@@ -384,7 +374,7 @@ mod tests {
             keys(&parse(name, text).unwrap(), "", &mut found);
             found.sort();
             all.push(found);
-            for (task, _) in TASKS {
+            for task in e2h_env::registry() {
                 let resolved = RunConfig::resolve(name, task, &[]).unwrap();
                 let again = RunConfig::from_text(name, &resolved.text).unwrap();
                 assert_eq!(resolved.config, again.config);
@@ -395,8 +385,7 @@ mod tests {
 
     #[test]
     fn task_files_agree_with_their_tasks() {
-        assert_eq!(TASKS.map(|(name, _)| name), e2h_env::registry());
-        for (name, _) in TASKS {
+        for name in e2h_env::registry() {
             let config = RunConfig::resolve("paper", name, &[]).unwrap().config;
             let task = e2h_env::task(name, &config.task.options()).unwrap();
             assert_eq!(config.refine.suffix.enabled, !task.homes(), "{name}");

@@ -6,9 +6,11 @@ use crate::{Error, Result};
 use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use e2h_env::Task;
+use e2h_report::folder::{
+    IDENTITY_FILE, Identity, LAYOUT, SUMS_FILE as FILES, compare, read_json, sealed, sha256,
+};
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
-use sha2::{Digest as _, Sha256};
 use std::borrow::Borrow;
 use std::collections::BTreeMap;
 use std::fs::{File, TryLockError};
@@ -16,16 +18,10 @@ use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Layout version of a run directory; 2: episodes are LeRobot datasets.
-const FORMAT: u32 = 2;
 /// The robot's name in datasets.
 const ROBOT: &str = "panda";
 /// Beside the folders of a dataset: what this project knows of it.
 const NOTES: &str = "notes.json";
-/// Beside them too: SHA-256 of every other file of the dataset.
-const FILES: &str = "files.json";
-/// Begins a sealed JSON file, before the SHA-256 of all that follows it.
-const SEAL: &str = "{\n  \"sha256\": \"";
 /// State of a training in progress, in the folder of its policy.
 pub(crate) const TRAINING: &str = "training.safetensors";
 /// Ends the name of a dataset that is being written.
@@ -34,22 +30,6 @@ const UNFINISHED: &str = ".unfinished";
 const TEMPORARY: [&str; 2] = [".tmp", ".new-"];
 /// Folders below a run's that it writes into: `iteration_NN/segments/data/chunk-000`, and one more.
 const DEEPEST: usize = 5;
-
-/// What a run is; written once, compared on resume.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Identity {
-    format: u32,
-    pub(crate) task: String,
-    pub(crate) preset: String,
-    pub(crate) seed: u64,
-    /// None in runs of version 0.1, which were all of the default one.
-    #[serde(default = "default_method")]
-    pub(crate) method: String,
-}
-
-fn default_method() -> String {
-    crate::methods::DEFAULT.to_owned()
-}
 
 /// A run directory that is this run's own.
 #[derive(Debug, Clone)]
@@ -108,14 +88,6 @@ fn sweep(folder: &Path, depth: usize) -> Result<()> {
     Ok(())
 }
 
-fn hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
-}
-
-fn holds_digest(line: &str) -> bool {
-    line.split(|c: char| !c.is_ascii_hexdigit()).any(|word| word.len() == 64)
-}
-
 pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Error {
     let path = path.to_owned();
     move |source| Error::Io { doing, path, source }
@@ -123,9 +95,7 @@ pub(crate) fn io(doing: &'static str, path: &Path) -> impl FnOnce(std::io::Error
 
 /// Writes beside the place, syncs, renames; makes the folder when it is not there.
 pub(crate) fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
-    let dir = path.parent().unwrap_or(Path::new("."));
-    std::fs::create_dir_all(dir).map_err(io("creating", dir))?;
-    Ok(crate::report::write_atomic(path, bytes)?)
+    Ok(e2h_data::write_atomic(path, bytes)?)
 }
 
 fn sync(dir: &Path) -> Result<()> {
@@ -159,18 +129,19 @@ impl Directory {
     ) -> Result<Self> {
         let resume = options.resume;
         let identity = Identity {
-            format: FORMAT,
+            format: LAYOUT,
             task: options.task.clone(),
             preset: resolved.preset.clone(),
             seed: options.seed,
             method: options.method.clone(),
         };
-        let file = path.join("run.json");
+        let file = path.join(IDENTITY_FILE);
         if resume && !path.exists() {
             return Err(Error::Nothing(path.to_owned()));
         }
         // A folder without run.json is a run that was killed at its first instant, or somebody else's.
-        let ours = |name: &str| name == "config.toml" || name == LOCK || name.starts_with(".tmp");
+        let temporary = |name: &str| TEMPORARY.iter().any(|t| name.starts_with(t));
+        let ours = |name: &str| name == "config.toml" || name == LOCK || temporary(name);
         let foreign = path.exists()
             && !file.exists()
             && std::fs::read_dir(path)
@@ -185,19 +156,19 @@ impl Directory {
         sweep(path, DEEPEST)?;
         if !file.exists() {
             write_atomic(&path.join("config.toml"), resolved.text.as_bytes())?;
-            this.put("run.json", &identity)?;
+            this.put(IDENTITY_FILE, &identity)?;
             return Ok(this);
         }
         // Made by another process since it was looked for.
         if !resume {
             return Err(Error::Exists(path.to_owned()));
         }
-        let found: Identity = this.get("run.json")?.unwrap_or_else(|| identity.clone());
+        let found: Identity = this.get(IDENTITY_FILE)?.unwrap_or_else(|| identity.clone());
         let differs = |quantity: &str, expected: String, found: String| {
             Err(Error::Foreign { path: path.to_owned(), quantity: quantity.to_owned(), expected, found })
         };
-        if found.format != FORMAT {
-            return differs("layout version", FORMAT.to_string(), found.format.to_string());
+        if found.format != LAYOUT {
+            return differs("layout version", LAYOUT.to_string(), found.format.to_string());
         }
         if found != identity {
             let text = |i: &Identity| format!("{} {} {} seed {}", i.task, i.preset, i.method, i.seed);
@@ -226,23 +197,6 @@ impl Directory {
         Ok(this)
     }
 
-    /// A run directory that is there, to be read only.
-    pub(crate) fn existing(path: &Path) -> Result<(Self, Identity)> {
-        let this = Self { path: path.to_owned(), _lock: None };
-        let foreign = |expected: &str, found: String| Error::Foreign {
-            path: path.to_owned(),
-            quantity: "run directory".to_owned(),
-            expected: expected.to_owned(),
-            found,
-        };
-        let identity: Identity =
-            this.get("run.json")?.ok_or_else(|| foreign("a file run.json", "none".to_owned()))?;
-        if identity.format != FORMAT {
-            return Err(foreign(&format!("layout version {FORMAT}"), identity.format.to_string()));
-        }
-        Ok((this, identity))
-    }
-
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
@@ -254,13 +208,13 @@ impl Directory {
     /// SHA-256 of a file, to verify it with when it is read again.
     pub(crate) fn sha256(&self, name: &str) -> Result<String> {
         let path = self.join(name);
-        Ok(hex(&std::fs::read(&path).map_err(io("reading", &path))?))
+        Ok(sha256(&std::fs::read(&path).map_err(io("reading", &path))?))
     }
 
     /// Refuses a file that is not the one that was written; without a checksum any is taken.
     pub(crate) fn verify(&self, name: &str, sha256: Option<&str>) -> Result<()> {
         let Some(expected) = sha256 else { return Ok(()) };
-        self.compare(name, expected, self.sha256(name)?)
+        Ok(compare(&self.join(name), expected, self.sha256(name)?)?)
     }
 
     /// SHA-256 of those of the files that are there, by their names.
@@ -273,14 +227,6 @@ impl Directory {
     pub(crate) fn verify_seals(&self, seals: &BTreeMap<String, String>) -> Result<()> {
         let mut there = seals.iter().filter(|(name, _)| self.join(name).exists());
         there.try_for_each(|(name, sum)| self.verify(name, Some(sum)))
-    }
-
-    fn compare(&self, name: &str, expected: &str, found: String) -> Result<()> {
-        if found == expected {
-            return Ok(());
-        }
-        let (path, expected) = (self.join(name), e2h_core::one_line(expected));
-        Err(Error::Foreign { path, quantity: "SHA-256".to_owned(), expected, found })
     }
 
     /// SHA-256 of every file below a folder, by its path there.
@@ -301,11 +247,7 @@ impl Directory {
 
     /// Writes `value`, which has named fields, as JSON with the SHA-256 of its text, which [`Directory::get`] compares.
     pub(crate) fn put_sealed<T: Serialize>(&self, name: &str, value: &T) -> Result<()> {
-        let text = serde_json::to_string_pretty(value).map(|text| match text.strip_prefix("{\n") {
-            Some(rest) => format!("{SEAL}{}\",\n{rest}", hex(format!("{rest}\n").as_bytes())),
-            None => text,
-        });
-        self.put_text(name, text)
+        self.put_text(name, serde_json::to_string_pretty(value).map(|text| sealed(&text)))
     }
 
     /// Writes `value` as JSON.
@@ -329,35 +271,9 @@ impl Directory {
         write_atomic(&path, format!("{text}\n").as_bytes())
     }
 
-    /// Reads JSON; none when the file is not there.
+    /// Reads JSON, sealed or not; none when the file is not there.
     pub(crate) fn get<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>> {
-        let path = self.join(name);
-        let text = match std::fs::read_to_string(&path) {
-            Ok(text) => text,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(io("reading", &path)(e)),
-        };
-        // Runs of version 0.1 have no seals.
-        let sealed = text.strip_prefix(SEAL).and_then(|rest| rest.split_once("\",\n"));
-        let text = match sealed {
-            Some((seal, rest)) => {
-                self.compare(name, seal, hex(rest.as_bytes()))?;
-                format!("{{\n{rest}")
-            }
-            // Nothing but sums begins with a digest: the seal itself is damaged.
-            None if !name.ends_with(FILES) && text.lines().nth(1).is_some_and(holds_digest) => {
-                let found = text.lines().nth(1).unwrap_or_default().trim().to_owned();
-                let (quantity, expected) = ("seal".to_owned(), "\"sha256\"".to_owned());
-                return Err(Error::Foreign { path, quantity, expected, found });
-            }
-            None => text,
-        };
-        serde_json::from_str(&text).map(Some).map_err(|e| Error::Foreign {
-            path,
-            quantity: "file".to_owned(),
-            expected: "one that this run wrote".to_owned(),
-            found: e.to_string(),
-        })
+        Ok(read_json(&self.join(name))?)
     }
 
     /// Writes a LeRobot dataset and a JSON file beside its folders; it appears whole or not at all. Without episodes there is only

@@ -42,9 +42,6 @@ pub enum Error {
     /// The system does not let signals be handled.
     #[error("handling signals: {0}")]
     Signals(std::io::Error),
-    /// This build cannot do what was asked.
-    #[error("{0}")]
-    Unsupported(String),
     /// A demonstrator could not do its task.
     #[error("{0}")]
     Demonstrations(String),
@@ -84,9 +81,9 @@ pub enum Error {
     /// An episode does not hold together.
     #[error(transparent)]
     Core(#[from] e2h_core::Error),
-    /// The report could not be made.
+    /// A record could not be read, or a page, picture or event file could not be made.
     #[error(transparent)]
-    Report(#[from] crate::report::Error),
+    Report(#[from] e2h_report::Error),
 }
 
 fn signal_name(signal: &i32) -> String {

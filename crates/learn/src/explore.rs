@@ -159,7 +159,7 @@ impl Wander {
 
     /// By how much the goal of the last step was displaced.
     pub(crate) fn now(&self) -> e2h_core::Excursion {
-        #[allow(clippy::cast_possible_truncation, reason = "stored episodes are f32")]
+        // Stored episodes are f32.
         self.now.map(|v| v as f32)
     }
 

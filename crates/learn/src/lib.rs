@@ -1,4 +1,4 @@
-//! The closed loop of Auto-E2H: collection, iteration, evaluation, run directory and report.
+//! The closed loop of Auto-E2H: collection, iteration, evaluation and the run directory.
 //!
 //! A [`Run`] is the method with its stages as functions; `examples/nut_assembly.rs` reads them top to bottom.
 //!
@@ -24,17 +24,15 @@ mod explore;
 pub mod hub;
 mod method;
 pub mod methods;
-mod picture;
 mod policy_class;
 mod progress;
 mod published;
-pub mod record;
-pub mod report;
 mod rollout;
 mod run;
 mod stop;
-pub mod tensorboard;
-pub mod view;
+
+pub(crate) use e2h_report::picture;
+pub use e2h_report::{self as report, record, tensorboard, view};
 
 pub use collect::{Collected, collect};
 pub use config::{Resolved, RunConfig};

@@ -1,4 +1,4 @@
-//! One progress line a stage, on standard error, with what matters in it.
+//! One progress line per stage, on standard error, with what matters in it.
 
 use crate::{Result, Stop};
 use e2h_core::mention;

@@ -37,11 +37,8 @@ impl Published {
             .map_err(|e| foreign("run configuration", "one of this version", e.to_string()))?;
         // Settings are as foreign as weights: what builds the environment is looked at like a configuration of one's own.
         config.validate().map_err(|e| foreign("run configuration", "values that work", e.to_string()))?;
-        let direction = match checkpoint.provenance.direction.as_str() {
-            "hard" => Direction::Hard,
-            "easy" => Direction::Easy,
-            other => return Err(foreign("direction", "hard or easy", other.to_owned())),
-        };
+        let direction = checkpoint.provenance.direction;
+        let direction = direction.ok_or_else(|| foreign("direction", "hard or easy", "none".to_owned()))?;
         let task = e2h_env::task(&config.task.name, &config.task.options())?;
         let mut env = Env::new(task, &config.env)?;
         let p = &checkpoint.config;

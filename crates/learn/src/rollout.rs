@@ -7,14 +7,14 @@
 use crate::Result;
 use crate::explore::Wander;
 use e2h_core::{Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng, stream};
-use e2h_env::Env;
+use e2h_env::{Env, Snapshot};
 use rayon::prelude::*;
 use std::collections::VecDeque;
 
 /// A rollout for people to see, every second control step: physical states, which are small, and drawn only if they are wanted.
 #[derive(Default)]
 pub(crate) struct Film {
-    states: Vec<Vec<f64>>,
+    states: Vec<Snapshot>,
 }
 
 impl Film {
@@ -24,7 +24,7 @@ impl Film {
 
     /// The pictures, drawn by any environment of the same task.
     pub(crate) fn draw(&self, env: &mut Env, camera: &str, size: usize) -> Result<Vec<Image>> {
-        let picture = |state: &Vec<f64>| {
+        let picture = |state: &Snapshot| {
             env.restore(state)?;
             Ok(env.render(camera, size, size)?)
         };

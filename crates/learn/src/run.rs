@@ -20,7 +20,7 @@ use e2h_core::{Direction, Episode, Kind, Origin, Policy, stream};
 use e2h_data::{Normaliser, NormaliserConfig, Source};
 use e2h_env::{Env, Task, TaskOptions, demonstrate};
 use e2h_nn::Compute;
-use e2h_policy::{Critic, CriticReport, Provenance, train_critic};
+use e2h_policy::{Critic, CriticReport, CriticTraining, Provenance, train_critic};
 use e2h_refine::{kinematic_filter, reverse};
 use stage::PolicyStage;
 use std::collections::BTreeMap;
@@ -403,7 +403,7 @@ impl Run {
         let Lesson { candidates, refined, critic, notes, .. } = lesson;
         let mut fates = BTreeMap::new();
         for fate in refined.iter().flat_map(|r| &r.fates) {
-            *fates.entry(picture::fate_name(*fate).to_owned()).or_default() += 1;
+            *fates.entry(*fate).or_default() += 1;
         }
         if let Some((episode, refined)) = candidates.iter().zip(&refined).next() {
             let svg = picture::filter(episode, refined, &c.refine.kinematic)?;
@@ -567,14 +567,14 @@ impl Run {
     /// TensorBoard draws folders as curves of one chart, and a stage that goes on voids only its own later steps.
     fn events(&self, stage: &str, step: u64) -> Result<Option<Events>> {
         let folder = self.dir.join("tensorboard").join(stage);
-        self.options.tensorboard.then(|| Events::create(&folder, now(), step)).transpose()
+        Ok(self.options.tensorboard.then(|| Events::create(&folder, now(), step)).transpose()?)
     }
 
     fn provenance(&self, direction: Direction, iteration: u32) -> Result<Provenance> {
         let run = serde_json::to_value(self.config()).map_err(|e| Error::Config(e.to_string()))?;
         Ok(Provenance {
             task: self.options.task.clone(),
-            direction: direction.to_string(),
+            direction: Some(direction),
             preset: self.options.preset.clone(),
             seed: self.options.seed,
             iteration,
@@ -589,21 +589,21 @@ impl Toolbox for Run {
         let (c, iteration) = (self.config(), round.iteration);
         let network = &c.critic.network;
         let bar = self.progress.bar(&format!("critic {iteration}"), network.steps as u64);
-        let trained = train_critic(
-            &c.policy,
-            network,
-            &self.compute,
-            &round.demonstrations.normaliser,
-            &round.policy.weights()?,
-            &round.rollouts.hard,
-            c.env.horizon_hard,
-            self.options.seed,
-            &format!("critic/{iteration}"),
-            |step, loss| {
-                bar.set(step as u64, &format!("loss {loss:.4}"));
-                if self.progress.check().is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-            },
-        );
+        let training = CriticTraining {
+            policy: &c.policy,
+            critic: network,
+            compute: &self.compute,
+            normaliser: &round.demonstrations.normaliser,
+            policy_weights: &round.policy.weights()?,
+            rollouts: &round.rollouts.hard,
+            horizon: c.env.horizon_hard,
+            seed: self.options.seed,
+            purpose: &format!("critic/{iteration}"),
+        };
+        let trained = train_critic(&training, |step, loss| {
+            bar.set(step as u64, &format!("loss {loss:.4}"));
+            if self.progress.check().is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        });
         let (critic, report) = match trained {
             Err(e2h_policy::Error::Stopped { .. }) => {
                 return Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }));

@@ -5,6 +5,7 @@
 use e2h_core::{Action, ActionChunk, Direction, Observation, Origin, Policy, Pose, Rng};
 use e2h_env::{DemonstratorConfig, Env, EnvConfig, Expert, Sim, Task, TaskOptions, task};
 use e2h_learn::config::AfterFailure;
+use e2h_learn::record::ResetCause;
 use e2h_learn::{Collected, Progress, Result, RunConfig, collect, evaluate};
 use nalgebra::Vector3;
 use std::sync::Arc;
@@ -107,8 +108,8 @@ fn collected(env: Env) -> Result<Collected> {
     collect(vec![env], &Still, &Still, &config, &origin, &Progress::new(true))
 }
 
-fn resets(collected: &Collected) -> Vec<(&str, usize)> {
-    collected.resets.iter().map(|(cause, n)| (cause.as_str(), *n)).collect()
+fn resets(collected: &Collected) -> Vec<(ResetCause, usize)> {
+    collected.resets.iter().map(|(cause, n)| (*cause, *n)).collect()
 }
 
 #[test]
@@ -117,14 +118,17 @@ fn a_way_home_that_diverges_is_an_external_reset() {
     let seconds = (4 + HORIZON + 5) as f64 / e2h_core::CONTROL_HZ;
     let collected = collected(env(0, (seconds, 1))).unwrap();
     // The reset is to the easy task's start, where this policy fails; where the hard task starts the easy one is done.
-    assert_eq!(resets(&collected), [("easy_failed", 1), ("homing_diverged", 1), ("start", 1)]);
+    assert_eq!(
+        resets(&collected),
+        [(ResetCause::EasyFailed, 1), (ResetCause::HomingDiverged, 1), (ResetCause::Start, 1)]
+    );
     assert_eq!((collected.hard.len(), collected.easy_rollouts, collected.plain.resets), (3, 3, 2));
 }
 
 #[test]
 fn a_start_that_diverges_is_drawn_again_and_counted() {
     let collected = collected(env(2, (0.0, 0))).unwrap();
-    assert_eq!(resets(&collected), [("reset_diverged", 2), ("start", 1)]);
+    assert_eq!(resets(&collected), [(ResetCause::ResetDiverged, 2), (ResetCause::Start, 1)]);
     let evaluated =
         evaluate(vec![env(3, (0.0, 0))], &Still, Direction::Hard, 2, 0, None, &Progress::new(true)).unwrap();
     assert_eq!(evaluated.trials.len(), 2);

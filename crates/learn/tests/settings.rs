@@ -278,6 +278,7 @@ const CHANGES: &[Change] = &[
     ("refine.goal.percentile", Ok((Refine, "100.0"))),
     ("refine.goal.least", Ok((Refine, "0.05"))),
     ("refine.gate.enabled", Ok((Refine, "false"))),
+    ("refine.gate.slip_m", Ok((Refine, "0.000001"))),
     ("refine.advantage.gamma", Ok((Refine, "0.9"))),
     ("refine.advantage.lambda", Ok((Refine, "0.5"))),
     ("refine.advantage.smooth", Ok((Refine, "5"))),

@@ -16,9 +16,12 @@
 //! }
 //! ```
 
+mod cache;
 #[cfg(test)]
 #[allow(dead_code, reason = "what only the build script calls")]
 mod obtain;
+
+pub use cache::cache_dir;
 
 /// Version of MuJoCo that the bindings are made for.
 pub const VERSION: &str = "3.17.0";

@@ -1,6 +1,7 @@
 //! Where the pinned library comes from, and what is checked before it is used. Included by the build script; a module of
 //! the crate only under test.
 
+use super::cache::cache_dir;
 use sha2::{Digest, Sha256};
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
@@ -113,12 +114,8 @@ pub(crate) struct Settings {
 impl Settings {
     /// Reads the environment.
     pub(crate) fn from_environment(work: PathBuf) -> Self {
-        let base = env::var_os("E2H_MUJOCO_CACHE")
-            .map(PathBuf::from)
-            .or_else(|| env::var_os("XDG_CACHE_HOME").map(|d| PathBuf::from(d).join("auto-e2h")))
-            .or_else(|| env::var_os("HOME").map(|d| PathBuf::from(d).join(".cache/auto-e2h")));
         Self {
-            cache: base,
+            cache: cache_dir(),
             wheel: env::var_os("MUJOCO_WHEEL").map(PathBuf::from),
             offline: env::var("CARGO_NET_OFFLINE").is_ok_and(|v| v == "true" || v == "1"),
             work,

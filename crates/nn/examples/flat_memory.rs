@@ -1,7 +1,11 @@
 //! Shows that a warm training step takes no more memory: resident set at step 200 and at the last.
 //!
-//! `cargo run --release -p e2h-nn --example flat_memory [steps]`
+//! ```text
+//! cargo run --release -p e2h-nn --example flat_memory -- 2000
+//! ```
+
 use candle_core::{Device, Tensor};
+use clap::Parser;
 use e2h_nn::{
     Adam, AdamConfig, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, RgbEncoder, RgbEncoderConfig,
     UnetConfig, backward, mse, repeat_rows,
@@ -18,9 +22,18 @@ fn memory() -> (f64, u64) {
     (pages("/proc/self/statm", 1) as f64 * 4096.0 / 1e6, pages("/proc/self/stat", 9))
 }
 
+/// Shows that a warm training step takes no more memory.
+#[derive(Parser)]
+#[command(version, after_help = "Example:\n  cargo run --release -p e2h-nn --example flat_memory -- 2000")]
+struct Arguments {
+    /// Training steps.
+    #[arg(default_value_t = 2000)]
+    steps: usize,
+}
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     e2h_nn::tune_allocator();
-    let steps: usize = std::env::args().nth(1).map_or(Ok(2000), |s| s.parse())?;
+    let Arguments { steps } = Arguments::parse();
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let encoder = RgbEncoderConfig {
         height: 48,

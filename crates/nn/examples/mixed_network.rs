@@ -5,6 +5,8 @@
 //! ```
 //!
 //! It ends with an error of about 0.06, of frequencies from 1 to 6. (candle-nn's own `Conv1d` would learn from a wrong gradient.)
+
+use clap::Parser;
 use e2h_nn::candle_core::{DType, Device, Module, Result, Tensor};
 use e2h_nn::candle_nn::{self, VarBuilder, VarMap};
 use e2h_nn::rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
@@ -54,7 +56,13 @@ fn waves(n: usize, rng: &mut ChaCha8Rng) -> Result<(Tensor, Tensor)> {
     Ok((Tensor::from_vec(x, (n, LENGTH, 1), &Device::Cpu)?, Tensor::from_vec(y, (n, 1), &Device::Cpu)?))
 }
 
+/// Trains layers of candle-nn and of this crate together.
+#[derive(Parser)]
+#[command(version, after_help = "Example:\n  cargo run --release -p e2h-nn --example mixed_network")]
+struct Arguments {}
+
 fn main() -> std::result::Result<(), Box<dyn std::error::Error>> {
+    let Arguments {} = Arguments::parse();
     let mut rng = ChaCha8Rng::seed_from_u64(0);
     let (params, net) = Params::build(Mode::Train, &mut rng, Net::new)?;
     let mut adam = Adam::new(&AdamConfig::default(), &params)?;

@@ -1,11 +1,18 @@
-//! Times of the networks, in milliseconds: `cargo run --release -p e2h-nn --example speed [threads [part of a name]]`.
+//! Times of the networks, in milliseconds.
+//!
+//! ```text
+//! cargo run --release -p e2h-nn --example speed -- 2 encoder
+//! ```
+
 use candle_core::{Device, Tensor};
+use clap::Parser;
 use e2h_nn::{
     Adam, AdamConfig, Builder, ConditionalUnet1d, Ema, EmaConfig, Mode, Params, Result, RgbEncoder,
     RgbEncoderConfig, UnetConfig, backward, mse,
 };
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use std::sync::OnceLock;
 use std::time::Instant;
 
 /// Milliseconds that all threads of this process were on a processor, from `/proc` (zero elsewhere).
@@ -17,7 +24,7 @@ fn cpu_ms() -> f64 {
 
 /// Least and middle of some runs, after two that warm up, and their mean processor time.
 fn time(what: &str, runs: usize, mut f: impl FnMut() -> Result<()>) -> Result<()> {
-    if std::env::args().nth(2).is_some_and(|part| !what.contains(&part)) {
+    if PART.get().is_some_and(|part| !what.contains(part.as_str())) {
         return Ok(());
     }
     let mut all = Vec::with_capacity(runs);
@@ -114,11 +121,26 @@ fn all() -> Result<()> {
     Ok(())
 }
 
+/// Times the networks.
+#[derive(Parser)]
+#[command(version, after_help = "Example:\n  cargo run --release -p e2h-nn --example speed -- 2 encoder")]
+struct Arguments {
+    /// Threads (by default one per core).
+    threads: Option<usize>,
+    /// Times only what has this in its name.
+    part: Option<String>,
+}
+
+/// What is timed.
+static PART: OnceLock<String> = OnceLock::new();
+
 fn main() -> std::result::Result<(), Box<dyn std::error::Error>> {
     e2h_nn::tune_allocator();
-    if let Some(n) = std::env::args().nth(1) {
-        rayon::ThreadPoolBuilder::new().num_threads(n.parse()?).build_global()?;
+    let Arguments { threads, part } = Arguments::parse();
+    if let Some(n) = threads {
+        rayon::ThreadPoolBuilder::new().num_threads(n).build_global()?;
     }
+    PART.get_or_init(|| part.unwrap_or_default());
     e2h_core::say(format_args!("{} threads", rayon::current_num_threads()))?;
     Ok(all()?)
 }

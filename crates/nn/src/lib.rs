@@ -42,6 +42,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod builder;
 mod compute;
 mod error;
 mod grad;
@@ -64,10 +65,12 @@ mod weights;
 /// The tensors, the variables and the random numbers of this crate's interface.
 pub use {candle_core, candle_nn, rand_chacha};
 
+pub use builder::{Builder, Mode};
 pub use compute::{Compute, Precision, candle_operations};
 pub use error::{Error, Result};
 pub use grad::{Grads, backward, backward_many, no_grad};
 pub use graph::{Given, Gradients, with_gradient};
+pub use kernel::vector_unit;
 pub use layers::{
     Act, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Relu, SpatialSoftmax,
     dropout, repeat_rows, sinusoidal_embedding,
@@ -76,7 +79,7 @@ pub use loss::mse;
 pub use memory::tune_allocator;
 pub use mlp::Mlp;
 pub use optim::{Adam, AdamConfig, Ema, EmaConfig, LrSchedule, learning_rate};
-pub use params::{Builder, Mode, Params};
+pub use params::Params;
 pub use rgb::{RgbEncoder, RgbEncoderConfig};
 pub use unet::{ConditionalUnet1d, UnetConfig};
-pub use weights::{HostTensor, Weights, load_weights, load_weights_without, save_weights};
+pub use weights::{HostTensor, Weights, load_weights, load_weights_without, parse_weights, save_weights};

@@ -1,5 +1,5 @@
+use crate::builder::Builder;
 use crate::layers::{Linear, masked, relu};
-use crate::params::Builder;
 use crate::tape::run;
 use crate::{Error, Result};
 use candle_core::Tensor;

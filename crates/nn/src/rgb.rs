@@ -1,5 +1,5 @@
+use crate::builder::Builder;
 use crate::layers::{Act, Conv2d, Extra, GroupNorm, Linear, MaxPool2d, SpatialSoftmax, add, relu};
-use crate::params::Builder;
 use crate::tape::{Node, Tape, run};
 use crate::{Error, Result};
 use candle_core::Tensor;

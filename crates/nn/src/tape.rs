@@ -6,10 +6,10 @@
 //!
 //! On other devices nothing is recorded: values are tensors that Candle tracks, see [`crate::graph`].
 
+use crate::builder::Weight;
 use crate::compute::Backend;
 use crate::grad;
 use crate::kernel::add_assign;
-use crate::params::Weight;
 use crate::storage::slice;
 use crate::{Error, Result};
 use candle_core::{

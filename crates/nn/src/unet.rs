@@ -1,7 +1,7 @@
+use crate::builder::Builder;
 use crate::layers::{
     Act, Conv1d, ConvTranspose1d, Extra, GroupNorm, Linear, concat, mish, sinusoidal_embedding,
 };
-use crate::params::Builder;
 use crate::tape::{Node, Tape, run};
 use crate::{Error, Result};
 use candle_core::Tensor;

@@ -1,6 +1,7 @@
 //! Parameters that are shared with candle-nn: its layers in our networks, its models under our optimiser, weights both ways.
 
-use crate::params::{Builder, Init, Params};
+use crate::builder::{Builder, Init};
+use crate::params::Params;
 use crate::storage::host;
 use crate::weights::{HostTensor, Weights};
 use crate::{Error, Result};

@@ -93,15 +93,27 @@ pub fn load_weights_without(
         path: path.to_path_buf(),
         source,
     })?;
+    parse_weights(&bytes, path, skip)
+}
+
+/// The same of bytes that were read already; `path` is where they come from, for messages.
+///
+/// # Errors
+/// [`Error::File`] as in [`load_weights`].
+pub fn parse_weights(
+    bytes: &[u8],
+    path: &Path,
+    skip: impl Fn(&str) -> bool,
+) -> Result<(Weights, BTreeMap<String, String>)> {
     let not = |e: safetensors::SafeTensorError| Error::File {
         path: path.to_path_buf(),
         expected: "a safetensors file",
         found: printable(&e.to_string()),
     };
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(not)?;
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(not)?;
     let metadata = header.metadata().iter().flatten().map(|(k, v)| (k.clone(), v.clone())).collect();
     let mut weights = Weights::new();
-    for (name, view) in SafeTensors::deserialize(&bytes).map_err(not)?.tensors() {
+    for (name, view) in SafeTensors::deserialize(bytes).map_err(not)?.tensors() {
         if skip(&name) {
             continue;
         }

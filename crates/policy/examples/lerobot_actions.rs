@@ -9,27 +9,37 @@
 //! `INPUTS` is a safetensors file: `state` (To, S), perhaps `environment` (To, E), `images` (To, cameras, H, W, 3) from 0 to
 //! 255, `noise` (draws, T, A). `OUT` gets `actions` (Ta, A).
 
+use clap::Parser;
 use e2h_core::{Direction, Episode, Image, Observation, Origin};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_nn::{HostTensor, Weights, load_weights, save_weights};
 use e2h_policy::lerobot::{LerobotObservation, import};
 use e2h_policy::{DiffusionPolicy, PolicyConfig, Prediction, Provenance};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
 
+/// Our side of the checks of policies against LeRobot.
+#[derive(Parser)]
+#[command(
+    version,
+    after_help = "Example:\n  cargo run --release -p e2h-policy --example lerobot_actions -- ours CHECKPOINT INPUTS OUT"
+)]
+enum Arguments {
+    /// Writes a policy of ours with drawn weights.
+    Make { dir: PathBuf },
+    /// Writes the actions of a policy of ours.
+    Ours { checkpoint: PathBuf, inputs: String, out: String },
+    /// Writes the actions of a policy of LeRobot's.
+    Theirs { lerobot: PathBuf, inputs: String, out: String },
+}
+
 fn main() -> Result<()> {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    match arguments[..] {
-        ["make", dir] => make(dir.as_ref()),
-        ["ours", policy, inputs, out] => ours(policy.as_ref(), &Inputs::read(inputs)?, out),
-        ["theirs", policy, inputs, out] => theirs(policy.as_ref(), &Inputs::read(inputs)?, out),
-        _ => {
-            Err("usage: lerobot_actions make DIR | ours CHECKPOINT INPUTS OUT | theirs LEROBOT INPUTS OUT"
-                .into())
-        }
+    match Arguments::parse() {
+        Arguments::Make { dir } => make(&dir),
+        Arguments::Ours { checkpoint, inputs, out } => ours(&checkpoint, &Inputs::read(&inputs)?, &out),
+        Arguments::Theirs { lerobot, inputs, out } => theirs(&lerobot, &Inputs::read(&inputs)?, &out),
     }
 }
 
@@ -82,7 +92,7 @@ impl Inputs {
     }
 
     /// Images of one step.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "whole numbers from 0 to 255")]
+    // Whole numbers from 0 to 255.
     fn images(&self, step: usize) -> Vec<Image> {
         let Some(t) = self.0.get("images") else { return vec![] };
         let [_, cameras, height, width, _] = t.shape[..] else { return vec![] };

@@ -3,6 +3,7 @@
 use crate::config::TOOL_FRAME;
 use crate::{ImageScaling, PolicyConfig, Result};
 use candle_core::{Device, Tensor};
+use e2h_core::state::{EEF_QUATERNION, OBJECT_QUATERNION, eef_position, object_position};
 use e2h_core::{Episode, Observation, Rng, State};
 use e2h_data::Normaliser;
 use rand::Rng as _;
@@ -58,8 +59,7 @@ impl Host {
             let limit = |v: f32| v.clamp(-self.limit, self.limit);
             self.state.extend(normaliser.normalise_state(state).map(limit));
             if self.relative {
-                // In units of 10 cm: centred on zero and of the order of one, whatever the task's ranges are.
-                self.state.extend((0..3).map(|i| limit((state[7 + i] - state[i]) * 10.0)));
+                self.state.extend(from_tool(state).map(limit));
             }
             if self.tool_frame {
                 self.state.extend(in_tool_frame(state).map(limit));
@@ -119,6 +119,12 @@ impl Host {
     }
 }
 
+/// From the tool to the object, in units of 10 cm: centred on zero and of the order of one, whatever the task's ranges are.
+fn from_tool(state: &State) -> [f32; 3] {
+    let (object, tool) = (object_position(state), eef_position(state));
+    std::array::from_fn(|i| (object[i] - tool[i]) * 10.0)
+}
+
 /// The object's pose in the frame of the tool: position in units of 10 cm, and the first two columns of the rotation matrix.
 fn in_tool_frame(state: &State) -> [f32; TOOL_FRAME] {
     let columns = |q: &[f32]| {
@@ -130,9 +136,9 @@ fn in_tool_frame(state: &State) -> [f32; TOOL_FRAME] {
             [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
     };
-    let (tool, object) = (columns(&state[3..7]), columns(&state[10..14]));
+    let (tool, object) = (columns(&state[EEF_QUATERNION]), columns(&state[OBJECT_QUATERNION]));
     let seen = |v: [f32; 3]| tool.map(|axis| axis.iter().zip(&v).map(|(a, b)| a * b).sum::<f32>());
-    let position = seen([0, 1, 2].map(|i| (state[7 + i] - state[i]) * 10.0));
+    let position = seen(from_tool(state));
     let mut out = [0.0; TOOL_FRAME];
     for (slot, v) in out.iter_mut().zip([position, seen(object[0]), seen(object[1])].concat()) {
         *slot = v;

@@ -1,12 +1,12 @@
 //! The critic: how far along is this frame?
 
 use crate::batch::{Host, Rows};
-use crate::config::without_zero_clip;
 use crate::model::ConditionEncoder;
 use crate::train::{Skipped, sound};
+use crate::train_config::without_zero_clip;
 use crate::{CriticConfig, EncoderNorm, Error, PolicyConfig, Result};
 use candle_core::Tensor;
-use e2h_core::{Episode, Rng, Value, stream};
+use e2h_core::{Episode, Rng, stream};
 use e2h_data::Normaliser;
 use e2h_nn::{Adam, Builder, Compute, Mlp, Mode, Params, Weights, backward};
 use rand::Rng as _;
@@ -164,12 +164,6 @@ impl Critic {
     }
 }
 
-impl Value for Critic {
-    fn values(&self, episode: &Episode) -> e2h_core::Result<Vec<f32>> {
-        Ok(self.evaluate(episode)?)
-    }
-}
-
 /// `G_t = (T - t) r + r_T` with `r = -1 / (2 H)`, `r_T` 1 for a success and 0 otherwise (the paper's equation 9).
 fn target(episode: &Episode, t: usize, horizon: usize) -> f32 {
     let remaining = (episode.len() - t) as f32;
@@ -177,27 +171,51 @@ fn target(episode: &Episode, t: usize, horizon: usize) -> f32 {
     terminal - remaining / (2.0 * horizon as f32)
 }
 
-/// Trains a critic from scratch on hard rollouts, failures included; its encoders start from the policy's weights. It is
-/// computed, then and later, by `compute`.
+/// What a critic is trained with.
+#[derive(Clone, Copy)]
+pub struct CriticTraining<'a> {
+    /// Configuration of the policy whose rollouts it judges.
+    pub policy: &'a PolicyConfig,
+    /// Its own.
+    pub critic: &'a CriticConfig,
+    /// What computes it, then and later.
+    pub compute: &'a Compute,
+    /// Scaling of states.
+    pub normaliser: &'a Normaliser,
+    /// Weights of the policy: its encoders are what the critic's start from, where they fit.
+    pub policy_weights: &'a Weights,
+    /// Hard rollouts, failures included.
+    pub rollouts: &'a [Episode],
+    /// Horizon H of the hard task, control steps.
+    pub horizon: usize,
+    /// Run seed.
+    pub seed: u64,
+    /// What its random numbers are for.
+    pub purpose: &'a str,
+}
+
+/// Trains a critic from scratch.
 ///
 /// `progress` is told (steps done, loss) after every step, and may end the training.
 ///
 /// # Errors
 /// When there are no rollouts, they do not fit, the loss or a weight is not finite, the gradient has been too long for several steps,
 /// or `progress` broke off.
-#[allow(clippy::too_many_arguments, reason = "each is a different thing, and none has a natural default")]
 pub fn train_critic(
-    policy: &PolicyConfig,
-    critic: &CriticConfig,
-    compute: &Compute,
-    normaliser: &Normaliser,
-    policy_weights: &Weights,
-    rollouts: &[Episode],
-    horizon: usize,
-    seed: u64,
-    purpose: &str,
+    training: &CriticTraining<'_>,
     mut progress: impl FnMut(usize, f32) -> ControlFlow<()>,
 ) -> Result<(Critic, CriticReport)> {
+    let CriticTraining {
+        policy,
+        critic,
+        compute,
+        normaliser,
+        policy_weights,
+        rollouts,
+        horizon,
+        seed,
+        purpose,
+    } = *training;
     let mut order: Vec<&Episode> = rollouts.iter().filter(|e| !e.is_empty()).collect();
     if order.is_empty() {
         return Err(Error::Data("the critic needs at least one hard rollout, got none".to_owned()));

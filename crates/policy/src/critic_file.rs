@@ -1,6 +1,6 @@
 //! A critic on disk: `critic.json` and `model.safetensors` in one folder, which stand alone.
 
-use crate::checkpoint::{hex, read_weights, write_beside};
+use crate::folder::{read_description, read_verified, write_description, write_weights};
 use crate::{Critic, CriticConfig, Error, PolicyConfig, Result};
 use e2h_core::STATE_DIM;
 use e2h_data::Normaliser;
@@ -12,7 +12,6 @@ use std::path::Path;
 pub const CRITIC_FORMAT: u32 = 1;
 
 const CONFIG_FILE: &str = "critic.json";
-const WEIGHTS_FILE: &str = "model.safetensors";
 
 /// What a critic was trained on, and how well.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -78,24 +77,17 @@ impl Critic {
     /// # Errors
     /// When the folder cannot be written.
     pub fn save(&self, dir: &Path, critic: &CriticConfig, provenance: &CriticProvenance) -> Result<()> {
-        let io = |doing: &'static str, path: &Path| {
-            let path = path.to_owned();
-            move |source| Error::Io { doing, path, source }
-        };
-        std::fs::create_dir_all(dir).map_err(io("creating", dir))?;
-        let weights_path = dir.join(WEIGHTS_FILE);
-        e2h_nn::save_weights(&weights_path, &self.params.export()?, &BTreeMap::new())?;
-        let bytes = std::fs::read(&weights_path).map_err(io("reading back", &weights_path))?;
+        let weights_sha256 = write_weights(dir, &self.params.export()?, &BTreeMap::new())?;
         let file = File {
             format: CRITIC_FORMAT,
             state_dim: STATE_DIM,
-            weights_sha256: hex(&bytes),
+            weights_sha256,
             network: self.config.clone(),
             critic: critic.clone(),
             normaliser: self.normaliser.clone(),
             provenance: provenance.clone(),
         };
-        write_beside(dir, CONFIG_FILE, &file)
+        write_description(dir, CONFIG_FILE, &file)
     }
 
     /// Reads a folder that [`Critic::save`] wrote.
@@ -105,33 +97,13 @@ impl Critic {
     /// names what was expected and found.
     pub fn load(dir: &Path) -> Result<(Self, CriticProvenance)> {
         let path = dir.join(CONFIG_FILE);
-        let read = |path: &Path| {
-            std::fs::read(path).map_err(|source| Error::Io {
-                doing: "reading critic",
-                path: path.to_owned(),
-                source,
-            })
-        };
+        let numbers = [("format", u64::from(CRITIC_FORMAT)), ("state_dim", STATE_DIM as u64)];
+        let value = read_description(&path, None, &numbers)?;
         let fail = |problem: String| Error::Checkpoint { path: path.clone(), problem };
-        let value: serde_json::Value =
-            serde_json::from_slice(&read(&path)?).map_err(|e| fail(format!("expected JSON, found {e}")))?;
-        for (name, expected) in [("format", u64::from(CRITIC_FORMAT)), ("state_dim", STATE_DIM as u64)] {
-            let found = value.get(name).and_then(serde_json::Value::as_u64);
-            if found != Some(expected) {
-                let found = found.map_or("none".to_owned(), |f| f.to_string());
-                return Err(fail(format!("{name}: expected {expected}, found {found}")));
-            }
-        }
         let file: File = serde_json::from_value(value).map_err(|e| fail(e.to_string()))?;
         file.network.validate().map_err(|e| fail(e.to_string()))?;
         let normaliser = file.normaliser.check().map_err(|e| fail(e.to_string()))?;
-        let weights_path = dir.join(WEIGHTS_FILE);
-        let found = hex(&read(&weights_path)?);
-        if found != file.weights_sha256 {
-            let problem = format!("expected SHA-256 {}, found {found}", file.weights_sha256);
-            return Err(Error::Checkpoint { path: weights_path, problem });
-        }
-        let (weights, _) = read_weights(&weights_path)?;
+        let weights = read_verified(dir, &file.weights_sha256)?;
         // Up to version 0.1 a crop larger than the policy's was cut to it; the network says what was trained with.
         let settings = CriticConfig { crop_size: file.network.crop_size, ..file.critic };
         let critic = Self::with_weights(&file.network, &settings, &normaliser, &weights)

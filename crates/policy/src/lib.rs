@@ -29,20 +29,20 @@ mod critic;
 mod critic_file;
 mod ddim;
 mod error;
+mod folder;
 pub mod lerobot;
 mod model;
 mod policy;
 mod train;
+mod train_config;
 
 pub use checkpoint::{CHECKPOINT_FORMAT, Checkpoint, Provenance};
-pub use config::{
-    CriticConfig, EncoderNorm, ImageScaling, PolicyConfig, Prediction, SamplerKind, ScheduleConfig,
-    ScheduleKind, ScheduledAdam, TrainConfig,
-};
-pub use critic::{Critic, CriticReport, train_critic};
+pub use config::{EncoderNorm, ImageScaling, PolicyConfig, Prediction, SamplerKind};
+pub use critic::{Critic, CriticReport, CriticTraining, train_critic};
 pub use critic_file::{CRITIC_FORMAT, CriticProvenance};
 pub use ddim::{Ddim, DdimStep};
 pub use error::{Error, Result};
 pub use model::DiffusionModel;
 pub use policy::DiffusionPolicy;
 pub use train::{Trainer, TrainingData};
+pub use train_config::{CriticConfig, ScheduleConfig, ScheduleKind, ScheduledAdam, TrainConfig};

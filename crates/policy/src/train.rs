@@ -207,7 +207,7 @@ impl Trainer {
     /// # Errors
     /// When the data do not fit, the loss is not finite, or the gradient has been too long for several steps.
     pub fn step(&mut self, data: &TrainingData<'_>) -> Result<f32> {
-        // A stream a step: nothing of the generator has to be stored for an exact resume.
+        // A stream per step: nothing of the generator has to be stored for an exact resume.
         let mut rng = stream(self.seed, &self.purpose, 0, self.step as u64);
         let loss = self.loss(data, &mut rng)?;
         let value = loss.to_scalar::<f32>()?;

@@ -6,8 +6,8 @@ use e2h_core::{Direction, Episode, Image, Observation, Origin, Outcome, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_nn::{Compute, Precision, candle_operations};
 use e2h_policy::{
-    CriticConfig, DiffusionPolicy, PolicyConfig, Prediction, ScheduleConfig, ScheduleKind, ScheduledAdam,
-    TrainConfig, Trainer, TrainingData, train_critic,
+    CriticConfig, CriticTraining, DiffusionPolicy, PolicyConfig, Prediction, ScheduleConfig, ScheduleKind,
+    ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::cell::Cell;
 use std::sync::Arc;
@@ -167,19 +167,18 @@ fn the_critic_is_the_same() {
         adam: e2h_nn::AdamConfig { lr: 1e-3, ..Default::default() },
     };
     let train = |compute: &Compute| {
-        let (critic, report) = train_critic(
-            &config,
-            &critic,
+        let training = CriticTraining {
+            policy: &config,
+            critic: &critic,
             compute,
-            &normaliser,
-            &weights,
-            &rollouts,
-            100,
-            0,
-            "critic",
-            |_, _| std::ops::ControlFlow::Continue(()),
-        )
-        .unwrap();
+            normaliser: &normaliser,
+            policy_weights: &weights,
+            rollouts: &rollouts,
+            horizon: 100,
+            seed: 0,
+            purpose: "critic",
+        };
+        let (critic, report) = train_critic(&training, |_, _| std::ops::ControlFlow::Continue(())).unwrap();
         (critic.evaluate(&rollouts[0]).unwrap(), report)
     };
     let (own_values, own) = train(&here());

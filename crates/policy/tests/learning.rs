@@ -5,8 +5,8 @@
 use e2h_core::{Direction, Episode, Image, Observation, Origin, stream};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_policy::{
-    Checkpoint, CriticConfig, DiffusionPolicy, EncoderNorm, Error, PolicyConfig, Provenance, ScheduleConfig,
-    ScheduleKind, ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
+    Checkpoint, CriticConfig, CriticTraining, DiffusionPolicy, EncoderNorm, Error, PolicyConfig, Provenance,
+    ScheduleConfig, ScheduleKind, ScheduledAdam, TrainConfig, Trainer, TrainingData, train_critic,
 };
 use std::sync::Arc;
 
@@ -226,19 +226,18 @@ fn a_critic_learns_that_successes_end_higher_than_failures() {
         adam: e2h_nn::AdamConfig { lr: 2e-3, ..Default::default() },
     };
     let weights = policy.weights().unwrap();
-    let (critic, report) = train_critic(
-        &config,
-        &critic,
-        &e2h_nn::Compute::cpu(),
-        &normaliser,
-        &weights,
-        &rollouts,
-        100,
-        0,
-        "critic",
-        |_, _| std::ops::ControlFlow::Continue(()),
-    )
-    .unwrap();
+    let training = CriticTraining {
+        policy: &config,
+        critic: &critic,
+        compute: &e2h_nn::Compute::cpu(),
+        normaliser: &normaliser,
+        policy_weights: &weights,
+        rollouts: &rollouts,
+        horizon: 100,
+        seed: 0,
+        purpose: "critic",
+    };
+    let (critic, report) = train_critic(&training, |_, _| std::ops::ControlFlow::Continue(())).unwrap();
     assert!(report.train_loss < 0.05, "{}", report.train_loss);
     let values = critic.evaluate(&rollouts[0]).unwrap();
     assert_eq!(values.len(), 40);

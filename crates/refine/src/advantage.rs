@@ -64,7 +64,7 @@ impl AdvantageConfig {
 /// # Source
 /// Eq. 10 and its appendix. Eq. 10 asks for the value after the last row, which there is not: it counts as equal to the last.
 #[must_use]
-#[allow(clippy::cast_possible_truncation, reason = "computed in f64, kept as values are")]
+// Computed in f64, kept as values are.
 pub fn advantages(values: &[f32], config: &AdvantageConfig) -> Vec<f32> {
     smoothed(values, config).into_iter().map(|a| a as f32).collect()
 }
@@ -118,7 +118,7 @@ pub fn advantage_filter<E: Borrow<Episode>>(
     Ok(episodes.iter().zip(values).zip(&scores).map(refine).collect())
 }
 
-/// One finite value a frame.
+/// One finite value per frame.
 pub(crate) fn check_values(episode: usize, rows: usize, values: &[f32]) -> Result<()> {
     if rows != values.len() {
         return Err(Error::Frames { what: "values", episode, expected: rows, found: values.len() });

@@ -2,7 +2,7 @@
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// There must be one list of numbers an episode.
+    /// There must be one list of numbers per episode.
     #[error("expected one list of {what} for each of {expected} episode(s), got {found}")]
     Episodes {
         /// What the lists hold.
@@ -12,8 +12,8 @@ pub enum Error {
         /// Lists.
         found: usize,
     },
-    /// There must be one number a frame.
-    #[error("episode {episode}: expected {expected} {what}, one a frame, got {found}")]
+    /// There must be one number per frame.
+    #[error("episode {episode}: expected {expected} {what}, one per frame, got {found}")]
     Frames {
         /// What the numbers are.
         what: &'static str,

@@ -2,24 +2,40 @@ use crate::{Error, Result};
 use e2h_core::{Episode, Kind};
 use serde::{Deserialize, Serialize};
 
-/// What became of one input frame.
+/// What became of one input frame. In the order of the alphabet, which is the order in files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Fate {
-    /// It is a row of a segment, with its own images.
-    Kept,
-    /// Inside a run that stood still.
-    Static,
-    /// Inside a slow run, skipped when that was re-timed.
-    Resampled,
-    /// The critic saw too little progress.
-    LowAdvantage,
-    /// In a remainder too short to be a segment.
-    TooShort,
     /// After the value said that the goal was reached.
     AfterGoal,
     /// A dynamics model could not confirm the reversed transition.
     DynamicsError,
+    /// It is a row of a segment, with its own images.
+    Kept,
+    /// The critic saw too little progress.
+    LowAdvantage,
+    /// Inside a slow run, skipped when that was re-timed.
+    Resampled,
+    /// Inside a run that stood still.
+    Static,
+    /// In a remainder too short to be a segment.
+    TooShort,
+}
+
+impl Fate {
+    /// What files call it; its JSON is the same.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Kept => "kept",
+            Self::Static => "static",
+            Self::Resampled => "resampled",
+            Self::LowAdvantage => "low_advantage",
+            Self::TooShort => "too_short",
+            Self::AfterGoal => "after_goal",
+            Self::DynamicsError => "dynamics_error",
+        }
+    }
 }
 
 /// How many frames met which fate. The fates add up to `frames`.

@@ -1,5 +1,6 @@
 use crate::{limits, percentile};
 use e2h_core::Episode;
+use e2h_core::state::object_position;
 use serde::{Deserialize, Serialize};
 
 /// Whether a reversal may end further out than the demonstrations do.
@@ -75,7 +76,7 @@ impl Goal {
 }
 
 fn last_position(episode: &Episode) -> Option<[f32; 3]> {
-    episode.state.last().map(|s| [s[7], s[8], s[9]])
+    episode.state.last().map(object_position)
 }
 
 fn distance(a: &[f32; 3], b: &[f32; 3]) -> f64 {

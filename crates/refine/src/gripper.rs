@@ -1,5 +1,6 @@
 use crate::{ReverseConfig, limits};
-use e2h_core::Episode;
+use e2h_core::{Episode, state};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 /// Whether the gripper counts as open at every row: open above `open_at`, closed below `close_at`, in between as before.
@@ -28,7 +29,7 @@ pub fn gripper_switches(episode: &Episode, config: &ReverseConfig) -> (usize, us
 /// # Source
 /// Not in the paper. In the prototype reversals with exactly one closing and one opening replayed in all of 50 cases,
 /// against 58 of 61 of all successful recordings.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GateConfig {
     /// False accepts everything, as the paper does.
@@ -37,13 +38,16 @@ pub struct GateConfig {
     pub closings: usize,
     /// Openings that it must show; count.
     pub openings: usize,
+    /// A recording whose object moved further than this in the closed hand while it was carried is not accepted, m: backwards,
+    /// it would have to slip by itself. 0 does not look.
+    pub slip_m: f64,
 }
 
 impl Default for GateConfig {
     fn default() -> Self {
         // Differs: the paper has no such gate; `enabled = false` is its rule. A recording that lets go and grasps again
         // replays backwards only by luck.
-        Self { enabled: true, closings: 1, openings: 1 }
+        Self { enabled: true, closings: 1, openings: 1, slip_m: 0.0 }
     }
 }
 
@@ -54,6 +58,7 @@ impl GateConfig {
         let counts = [("closings", self.closings), ("openings", self.openings)];
         let mut problems: Vec<String> =
             counts.into_iter().filter_map(|(name, n)| limits::frames(name, n, 0)).collect();
+        problems.extend(limits::amount("slip_m", self.slip_m, true));
         // Between two closings there is an opening: other counts would accept nothing.
         if self.closings.abs_diff(self.openings) > 1 {
             problems.push(format!(
@@ -65,10 +70,37 @@ impl GateConfig {
     }
 }
 
-/// Whether the gripper switches as often as a valid reversal of this task does.
+/// Whether the gripper switches as often as a valid reversal of this task does, and held the object still.
 #[must_use]
 pub fn gate(episode: &Episode, config: &GateConfig, reverse: &ReverseConfig) -> bool {
-    !config.enabled || gripper_switches(episode, reverse) == (config.closings, config.openings)
+    let switches = || gripper_switches(episode, reverse) == (config.closings, config.openings);
+    let held = || config.slip_m == 0.0 || config.closings == 0 || slip(episode, reverse) <= config.slip_m;
+    !config.enabled || (switches() && held())
+}
+
+/// Object that moves less than this in a control step is not being carried, m.
+const CARRIED: f64 = 0.001;
+
+fn object(episode: &Episode, t: usize) -> Vector3<f64> {
+    Vector3::from(state::object_position(&episode.state[t]).map(f64::from))
+}
+
+/// How far the object moved in the closed hand while it was carried, m: the largest distance of its position in the frame of the
+/// hand from that halfway. 0 where nothing is carried.
+#[must_use]
+pub fn slip(episode: &Episode, config: &ReverseConfig) -> f64 {
+    let open = open_states(episode, config);
+    let carried = (1..episode.len()).filter(|&t| {
+        let moved = object(episode, t) - object(episode, t - 1);
+        !open[t] && !open[t - 1] && moved.norm() > CARRIED
+    });
+    let in_hand = |t: usize| {
+        let hand = episode.eef(t);
+        hand.orientation.inverse() * (object(episode, t) - hand.position)
+    };
+    let places: Vec<_> = carried.map(in_hand).collect();
+    let Some(middle) = places.get(places.len() / 2) else { return 0.0 };
+    places.iter().map(|p| (p - middle).norm()).fold(0.0, f64::max)
 }
 
 #[cfg(test)]
@@ -91,6 +123,27 @@ mod tests {
         let twice = with_openings(&[0.08, 0.05, 0.08, 0.05]);
         assert_eq!(gripper_switches(&twice, &reversal()), (2, 1));
         assert_eq!(gripper_switches(&along(&[]), &reversal()), (0, 0));
+    }
+
+    /// A hand that carries the object 2 cm a step, and in which it slips by 5 mm on the way.
+    #[test]
+    fn what_slips_in_the_hand_does_not_pass() {
+        let carried = |slip: f32| {
+            let mut e = along(&(0..12).map(|t| 0.02 * f64::from(t)).collect::<Vec<_>>());
+            for (t, s) in e.state.iter_mut().enumerate() {
+                s[14] = if (2..10).contains(&t) { 0.03 } else { 0.08 };
+                let hand = s[0].clamp(0.04, 0.18);
+                let height = s[2] - 0.02 + if t > 6 { slip } else { 0.0 };
+                (s[7], s[8], s[9]) = (hand, s[1], height);
+            }
+            e
+        };
+        assert!(slip(&carried(0.0), &reversal()) < 1e-6);
+        assert!((slip(&carried(0.005), &reversal()) - 0.005).abs() < 1e-6);
+        let config = GateConfig { slip_m: 0.003, ..GateConfig::default() };
+        assert!(gate(&carried(0.002), &config, &reversal()) && !gate(&carried(0.005), &config, &reversal()));
+        assert!(gate(&carried(0.005), &GateConfig::default(), &reversal()));
+        assert_eq!(slip(&along(&[]), &reversal()), 0.0);
     }
 
     #[test]

@@ -5,6 +5,7 @@ use crate::reverse::{continue_path, goals};
 use crate::smooth::smooth;
 use crate::still::still_runs;
 use crate::{Fate, Refined, ReverseConfig, limits};
+use e2h_core::state::EEF;
 use e2h_core::{CONTROL_HZ, Episode, Pose};
 use serde::{Deserialize, Serialize};
 
@@ -25,7 +26,7 @@ pub struct KinematicConfig {
     pub protect_gripper: bool,
     /// How near, frames on either side.
     pub protect_frames: usize,
-    /// The gripper moves when its opening changes by more than this, m a frame.
+    /// The gripper moves when its opening changes by more than this, m per frame.
     pub gripper_motion: f64,
     /// A run is split where the object moved further than this on its own, neither at rest nor with the hand, m; 0 does not
     /// look at the object (the paper).
@@ -34,7 +35,7 @@ pub struct KinematicConfig {
     pub slow_speed: f64,
     /// Shorter slow runs are left alone, frames. The paper gives none.
     pub slow_min_frames: usize,
-    /// Step that slow runs are re-timed to, m a frame. Paper: 0.005, that is 0.1 m/s.
+    /// Step that slow runs are re-timed to, m per frame. Paper: 0.005, that is 0.1 m/s.
     pub resample_step: f64,
     /// Re-timed runs turn at least at this rate where turning takes longer than moving, rad a frame; 0 lets them turn as
     /// fast as the arc length says (the paper).
@@ -89,7 +90,7 @@ impl KinematicConfig {
     #[must_use]
     pub fn at_rate(&self, hz: f64) -> Self {
         let longer = CONTROL_HZ / hz;
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "small and not negative")]
+        // Small and not negative.
         let frames = |n: usize| (n as f64 / longer).round() as usize;
         Self {
             static_speed: self.static_speed * longer,
@@ -185,7 +186,7 @@ fn assemble(episode: &Episode, nodes: &[Node], reverse: &ReverseConfig) -> Episo
     let rows: Vec<usize> = nodes.iter().map(|n| n.row).collect();
     let mut out = episode.select(&rows);
     for (state, node) in out.state.iter_mut().zip(nodes).filter(|(_, n)| n.between) {
-        state[..7].copy_from_slice(&node.pose.to_row(&reverse.reference_quaternion));
+        state[EEF].copy_from_slice(&node.pose.to_row(&reverse.reference_quaternion));
     }
     continue_path(&mut out, &reverse.reference_quaternion, reverse.object_reference);
     let poses: Vec<Pose> = nodes.iter().map(|n| n.pose).collect();

@@ -47,7 +47,7 @@ pub use compose::critic_filter;
 pub use error::{Error, Result};
 pub use fate::{Fate, RefineReport, Refined, merge_fates};
 pub use goal::{Goal, GoalConfig};
-pub use gripper::{GateConfig, gate, gripper_switches};
+pub use gripper::{GateConfig, gate, gripper_switches, slip};
 pub use kinematic::{KinematicConfig, kinematic_filter};
 pub use resample::resample;
 pub use reverse::{Labels, ReverseConfig, rebuild_actions, reverse};

@@ -1,5 +1,6 @@
 use crate::gripper::open_states;
 use crate::{KinematicConfig, ReverseConfig};
+use e2h_core::state::object_position;
 use e2h_core::{CONTROL_HZ, Episode, Pose};
 use nalgebra::Vector3;
 
@@ -51,7 +52,7 @@ pub(crate) fn slip(hand: Vector3<f64>, object: Vector3<f64>) -> f64 {
 
 /// Positions of the object, m.
 pub(crate) fn objects(episode: &Episode) -> Vec<Vector3<f64>> {
-    episode.state.iter().map(|s| Vector3::new(f64::from(s[7]), f64::from(s[8]), f64::from(s[9]))).collect()
+    episode.state.iter().map(|s| Vector3::from(object_position(s).map(f64::from))).collect()
 }
 
 /// Speed at every row without any window, m/s, as stored.
@@ -60,7 +61,7 @@ pub(crate) fn episode_speeds(episode: &Episode) -> Vec<f32> {
     narrow(&motion(&poses, 1).speed)
 }
 
-#[allow(clippy::cast_possible_truncation, reason = "diagnostics for pictures")]
+// Diagnostics for pictures.
 pub(crate) fn narrow(values: &[f64]) -> Vec<f32> {
     values.iter().map(|&v| v as f32).collect()
 }
@@ -103,7 +104,7 @@ mod tests {
 
     #[test]
     fn speed_is_that_of_the_step_ahead_in_metres_per_second() {
-        // 2 mm a frame at 20 Hz are 0.04 m/s; the last row gets the step that reached it.
+        // 2 mm per frame at 20 Hz are 0.04 m/s; the last row gets the step that reached it.
         assert_close(&motion(&poses(&[0.0, 0.002, 0.005, 0.010]), 0).speed, &[0.04, 0.06, 0.1, 0.1]);
         assert_close(&motion(&poses(&[0.3]), 0).speed, &[0.0]);
         assert_close(&motion(&poses(&[]), 3).speed, &[]);

@@ -1,5 +1,6 @@
 use crate::reverse::continue_path;
 use crate::{Error, Result};
+use e2h_core::state::{EEF, OPENING};
 use e2h_core::{Episode, Pose};
 
 /// An episode at another rate, Hz. Poses lie between their neighbours (position linear, orientation slerp), the gripper's
@@ -20,25 +21,25 @@ pub fn resample(episode: &Episode, from_hz: f64, to_hz: f64, reference: &[f64; 4
     let last = episode.len() - 1;
     let step = from_hz / to_hz;
     // A hair more, so that the last row is met when the rates divide.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "not negative")]
+    // Not negative.
     let rows = (last as f64 / step + 1e-9) as usize + 1;
     let place = |k: usize| (k as f64 * step).min(last as f64);
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 <= place <= last")]
+    // 0 <= place <= last.
     let nearest: Vec<usize> = (0..rows).map(|k| place(k).round() as usize).collect();
     let mut out = episode.select(&nearest);
     // The last row may be passed by less than a step; it is still the end of the task.
     out.terminal = episode.terminal;
     for (k, state) in out.state.iter_mut().enumerate() {
-        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 <= place <= last")]
+        // 0 <= place <= last.
         let before = place(k).floor() as usize;
         let (after, f) = ((before + 1).min(last), place(k) - before as f64);
         if f > 1e-9 {
             let pose: Pose = episode.eef(before).interpolate(&episode.eef(after), f);
-            state[..7].copy_from_slice(&pose.to_row(reference));
+            state[EEF].copy_from_slice(&pose.to_row(reference));
             let (a, b) = (f64::from(episode.opening(before)), f64::from(episode.opening(after)));
-            #[allow(clippy::cast_possible_truncation, reason = "stored episodes are f32")]
+            // Stored episodes are f32.
             let width = (a + (b - a) * f) as f32;
-            state[14] = width;
+            state[OPENING] = width;
         }
     }
     continue_path(&mut out, reference, None);
@@ -55,7 +56,7 @@ mod tests {
 
     #[test]
     fn thirty_hertz_become_twenty() {
-        // 3 mm a frame at 30 Hz are 4.5 mm at 20 Hz.
+        // 3 mm per frame at 30 Hz are 4.5 mm at 20 Hz.
         let at_20 = resample(&along(&walk(&[(6, 0.003)])), 30.0, 20.0, &DOWN).unwrap();
         assert_eq!(at_20.source, [0, 2, 3, 5, 6]);
         assert_eq!(at_20.frames[0].image(1), &[2; 3]);

@@ -58,7 +58,7 @@ fn stretch(nodes: &[Node], objects: &[Vector3<f64>], config: &KinematicConfig, o
         clock.push(clock[clock.len() - 1] + duration(&pair[0], &pair[1], objects, config));
     }
     let total = clock[steps];
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 <= total <= steps")]
+    // 0 <= total <= steps.
     let fewer = (total.round() as usize).max(1);
     if fewer >= steps {
         out.extend_from_slice(&nodes[..steps]);

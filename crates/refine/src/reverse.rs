@@ -1,5 +1,6 @@
 use crate::gripper::open_states;
 use crate::limits;
+use e2h_core::state::{EEF_QUATERNION, OBJECT_QUATERNION};
 use e2h_core::{Action, Episode, Excursion, Pose, continue_signs};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -101,9 +102,10 @@ pub fn reverse(episode: &Episode, config: &ReverseConfig) -> Episode {
 /// Continues the signs of the quaternions of hand and object along the states, each from its reference on; the object's from
 /// its own first row where it has none.
 pub(crate) fn continue_path(episode: &mut Episode, reference: &[f64; 4], object: Option<[f64; 4]>) {
-    continue_signs(&mut episode.state, 3..7, reference);
-    if let Some(first) = episode.state.first().map(|s| [10, 11, 12, 13].map(|i| f64::from(s[i]))) {
-        continue_signs(&mut episode.state, 10..14, &object.unwrap_or(first));
+    continue_signs(&mut episode.state, EEF_QUATERNION, reference);
+    let first = |s: &e2h_core::State| std::array::from_fn(|i| f64::from(s[OBJECT_QUATERNION.start + i]));
+    if let Some(first) = episode.state.first().map(first) {
+        continue_signs(&mut episode.state, OBJECT_QUATERNION, &object.unwrap_or(first));
     }
 }
 

@@ -6,7 +6,7 @@ use e2h_data::lerobot::{Column, Dataset, Dtype, Feature, Table, Writer, encode_p
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// One row a control step at 20 Hz: x and y of the hand, m. The goal of the hard task lies at x = 0.
+/// One row per control step at 20 Hz: x and y of the hand, m. The goal of the hard task lies at x = 0.
 type Rows = Vec<(f32, f32)>;
 
 const STEP: f32 = 0.005;
@@ -231,9 +231,9 @@ fn a_critic_that_does_not_fit_is_refused_with_what_was_expected_and_found() {
     let json = std::fs::read_to_string(critic.join("critic.json")).unwrap();
     std::fs::write(critic.join("critic.json"), json.replace("\"state_dim\": 15", "\"state_dim\": 16"))
         .unwrap();
-    assert!(refused(&[]).contains("state_dim: expected 15, found 16"));
+    assert!(refused(&[]).contains("expected state_dim 15, found 16"));
     std::fs::write(critic.join("critic.json"), json.replace("\"format\": 1", "\"format\": 7")).unwrap();
-    assert!(refused(&[]).contains("format: expected 1, found 7"));
+    assert!(refused(&[]).contains("expected format 1, found 7"));
     std::fs::write(critic.join("critic.json"), &json).unwrap();
     let weights = critic.join("model.safetensors");
     let mut bytes = std::fs::read(&weights).unwrap();

@@ -7,7 +7,9 @@ use e2h_fuzz::container::{join, split, with_checksum};
 use e2h_fuzz::fixture::{Scratch, episode};
 use e2h_fuzz::{begin, judge, run};
 use e2h_nn::{AdamConfig, Compute};
-use e2h_policy::{Critic, CriticConfig, CriticProvenance, DiffusionPolicy, PolicyConfig, train_critic};
+use e2h_policy::{
+    Critic, CriticConfig, CriticProvenance, CriticTraining, DiffusionPolicy, PolicyConfig, train_critic,
+};
 use libfuzzer_sys::fuzz_target;
 
 const DESCRIPTION: &str = "critic.json";
@@ -30,11 +32,19 @@ thread_local! { static SCRATCH: Scratch = Scratch::new(|root| {
     };
     let policy = DiffusionPolicy::untrained(&network, &ranges, 1).expect("a policy");
     let weights = policy.weights().expect("weights");
-    let (critic, _) = train_critic(
-        &network, &config, &Compute::cpu(), &ranges, &weights, &[episode(0)], 10, 0, "fuzz",
-        |_, _| std::ops::ControlFlow::Continue(()),
-    )
-    .expect("a critic");
+    let training = CriticTraining {
+        policy: &network,
+        critic: &config,
+        compute: &Compute::cpu(),
+        normaliser: &ranges,
+        policy_weights: &weights,
+        rollouts: &[episode(0)],
+        horizon: 10,
+        seed: 0,
+        purpose: "fuzz",
+    };
+    let (critic, _) =
+        train_critic(&training, |_, _| std::ops::ControlFlow::Continue(())).expect("a critic");
     critic.save(root, &config, &CriticProvenance::default()).expect("a folder");
 }); }
 

@@ -1,5 +1,6 @@
 use super::episodes::{self, EpisodeSpan};
-use super::feature::{DEFAULT_FEATURES, Dtype, Feature, INSIDE, Info};
+use super::feature::{DEFAULT_FEATURES, Dtype, Feature};
+use super::info::{INSIDE, Info};
 use super::parquet_file::ParquetFile;
 use super::table::{Column, Table};
 use super::{mp4, tasks, video};

@@ -80,7 +80,7 @@ pub fn source_features() -> Features {
 /// | `source.fate` | what refinement made of the row: 0 kept; other codes are those of the filter that wrote them |
 ///
 /// # Shapes
-/// `frames` and `fates` have one entry a row.
+/// `frames` and `fates` have one entry per row.
 #[must_use]
 pub fn source_columns(
     origin: &Origin,
@@ -262,7 +262,7 @@ pub fn from_table(table: &Table, features: &Features, task: &str) -> Result<(Epi
 fn rows<const N: usize>(table: &Table, name: &str) -> Result<Vec<[f32; N]>> {
     let values = table.f32(name)?;
     if values.len() != table.rows * N {
-        return Err(column_error(name, format!("{N} numbers a row"), format!("{} in all", values.len())));
+        return Err(column_error(name, format!("{N} numbers per row"), format!("{} in all", values.len())));
     }
     Ok(values.as_chunks().0.to_vec())
 }

@@ -1,7 +1,9 @@
 //! `meta/episodes`: where each episode lies, and its statistics.
 
-use super::feature::{Dtype, Feature, Features, Info};
-use super::parquet_file::{ParquetFile, batch, lists, texts};
+use super::arrow::{batch, lists, texts};
+use super::feature::{Dtype, Feature, Features};
+use super::info::Info;
+use super::parquet_file::ParquetFile;
 use super::stats::{Bounds, FeatureStats, QUANTILES, Stats, bounds};
 use super::table::Column;
 use crate::Result;
@@ -253,7 +255,7 @@ fn stat_columns(name: &str, kind: Bounds, stats: &[&FeatureStats]) -> Vec<(Strin
             stats.iter().flat_map(|s| s.lists().nth(i).map(|(_, v)| v.clone()).unwrap_or_default()).collect();
         let bound = i < 2;
         let leaf: ArrayRef = match kind {
-            #[allow(clippy::cast_possible_truncation, reason = "came from an integer")]
+            // Came from an integer.
             Bounds::Integer if bound => {
                 Arc::new(Int64Array::from_iter_values(values.iter().map(|&v| v as i64)))
             }
@@ -306,7 +308,7 @@ pub(crate) fn read_stats(path: &Path, features: &Features, rows: usize) -> Resul
                     max: next(),
                     mean: next(),
                     std: next(),
-                    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a count")]
+                    // A count.
                     count: count.max(0.0) as u64,
                     quantiles: std::array::from_fn(|_| next()),
                 },

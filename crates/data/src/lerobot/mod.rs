@@ -9,16 +9,23 @@
 //! # Source
 //! LeRobot 0.4.4, format v3.0; checked against it by `tests/interop/run.sh`.
 
+mod arrow;
 mod check;
+mod check_rows;
 mod dataset;
 mod episode;
 mod episodes;
 mod feature;
+mod info;
 mod limits;
 mod mp4;
+mod packing;
 mod parquet_file;
+mod parquet_source;
+mod parquet_writer;
 mod picture;
 mod promises;
+mod repair;
 mod robot;
 mod stats;
 mod table;
@@ -26,18 +33,21 @@ mod tasks;
 mod video;
 mod writer;
 
-pub use check::{Fault, FaultKind, REMOVED, Report, check, repair};
+pub use check::{Fault, FaultKind, Report, check};
 pub use dataset::Dataset;
 pub use episode::{
     ACTION_NAMES, EXCURSION_NAMES, SOURCE_EXCURSION, SOURCE_FATE, SOURCE_FRAME, STATE_NAMES, features,
     features_of, from_table, source_columns, source_features, to_table,
 };
 pub use episodes::{EpisodeSpan, VideoSpan};
-pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Info, Skipped, VERSION};
+pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Skipped, VERSION};
+pub use info::Info;
 pub use picture::{decode_image as decode_png, encode as encode_png};
+pub use repair::{REMOVED, repair};
 pub use robot::{ColumnSlice, RobotColumns, Rotation};
 pub use stats::{FeatureStats, QUANTILES, Stats};
 pub use table::{Column, Table};
+pub use video::video_decoder;
 pub use writer::Writer;
 
 #[cfg(test)]

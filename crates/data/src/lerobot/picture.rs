@@ -18,7 +18,7 @@ const DENSEST: usize = 1032;
 /// Bytes of pixels that no file is refused for.
 const SMALL: usize = 1 << 16;
 
-/// An RGB image, 8 bits a channel, as a PNG file.
+/// An RGB image, 8 bits per channel, as a PNG file.
 ///
 /// # Shapes
 /// `data` (height, width, 3).

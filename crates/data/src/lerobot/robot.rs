@@ -1,9 +1,10 @@
 //! Recordings of any robot as episodes: which column holds the pose, which the gripper.
 
-use super::feature::Info;
+use super::info::Info;
 use super::table::{Table, column_error};
 use crate::{Error, Result};
-use e2h_core::{Episode, Origin, Outcome, align_hemisphere, continue_signs};
+use e2h_core::state::{EEF, OBJECT, OBJECT_QUATERNION, OPENING};
+use e2h_core::{Episode, Origin, Outcome, State, align_hemisphere, continue_signs};
 use std::str::FromStr;
 
 /// Some entries of a column, written `name`, `name[3]` or `name[0:7]`.
@@ -235,16 +236,16 @@ impl RobotColumns {
         let (closed, open) = self.gripper_range;
         let mut episode = Episode::new(origin, &[]);
         for (t, pose) in pose.iter().enumerate() {
-            let mut state = [0.0; 15];
-            self.place(pose, reference, &mut state[..7], &self.pose, t)?;
-            state[10] = 1.0;
+            let mut state = State::default();
+            self.place(pose, reference, &mut state[EEF], &self.pose, t)?;
+            state[OBJECT_QUATERNION.start] = 1.0;
             if let (Some(object), Some(slice)) = (&object, &self.object) {
-                self.place(&object[t], reference, &mut state[7..14], slice, t)?;
+                self.place(&object[t], reference, &mut state[OBJECT], slice, t)?;
             }
             let fraction = gripper.as_ref().map_or(1.0, |g| (g[t][0] - closed) / (open - closed));
-            #[allow(clippy::cast_possible_truncation, reason = "stored episodes are f32")]
+            // Stored episodes are f32.
             let width = (fraction.clamp(0.0, 1.0) * open_width) as f32;
-            state[14] = width;
+            state[OPENING] = width;
             let observation = e2h_core::Observation { state, frames: vec![] };
             episode
                 .push(&observation, &[0.0; 8])
@@ -280,7 +281,7 @@ impl RobotColumns {
             column_error(&format!("{slice}, row {row}"), "a unit quaternion", format!("{pose:?}"))
         })?;
         let all = pose[..3].iter().copied().chain(align_hemisphere(q, reference));
-        #[allow(clippy::cast_possible_truncation, reason = "stored episodes are f32")]
+        // Stored episodes are f32.
         for (slot, value) in out.iter_mut().zip(all) {
             *slot = value as f32;
         }

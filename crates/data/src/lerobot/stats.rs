@@ -16,7 +16,7 @@ const BINS: usize = 5000;
 /// Statistics of one feature. Units: the feature's; images are scaled to [0, 1].
 ///
 /// # Shapes
-/// Every list has one number an entry of the feature's last axis; 3 for images, one a channel.
+/// Every list has one number per entry of the feature's last axis; 3 for images, one per channel.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FeatureStats {
     /// Least value.
@@ -96,10 +96,10 @@ fn of_images(files: &[Vec<u8>], feature: &Feature, name: &str) -> Result<Option<
 
 /// Rows whose images count: about the three-quarters power of their number, at least 100, evenly spread.
 pub(crate) fn sampled_rows(rows: usize) -> Vec<usize> {
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "far below 2^52")]
+    // Far below 2^52.
     let count = ((rows as f64).powf(0.75) as usize).min(10_000).max(rows.min(100));
     let step = rows.saturating_sub(1) as f64 / count.saturating_sub(1).max(1) as f64;
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 <= i * step <= rows - 1")]
+    // 0 <= i * step <= rows - 1.
     (0..count).map(|i| ((i as f64 * step).round_ties_even() as usize).min(rows - 1)).collect()
 }
 
@@ -117,7 +117,7 @@ fn summary(column: &[(f64, f64)]) -> [f64; 9] {
     let (low, high) = (min - 1e-10, max + 1e-10);
     let width = (high - low) / BINS as f64;
     let edge = |i: usize| if i == BINS { high } else { low + width * i as f64 };
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the bins")]
+    // Clamped to the bins.
     let bin = |v: f64| if width > 0.0 { (((v - low) / width) as usize).min(BINS - 1) } else { 0 };
     for (slot, (_, share)) in out[4..].iter_mut().zip(QUANTILES) {
         let target = share * total;
@@ -200,7 +200,7 @@ pub(crate) enum Bounds {
     Float,
     Integer,
     Bool,
-    /// One number a channel, nested three deep.
+    /// One number per channel, nested three deep.
     Image,
 }
 
@@ -220,7 +220,7 @@ pub(crate) fn to_json(stats: &Stats, features: &Features) -> Value {
         let Some((_, found)) = stats.iter().find(|(n, _)| n == name) else { continue };
         let kind = bounds(feature);
         let number = |list: &str, v: f64| match (list, kind) {
-            #[allow(clippy::cast_possible_truncation, reason = "came from an integer")]
+            // Came from an integer.
             ("min" | "max", Bounds::Integer) => Value::from(v as i64),
             ("min" | "max", Bounds::Bool) => Value::from(v != 0.0),
             (_, Bounds::Image) => Value::from(vec![vec![v]]),

@@ -17,7 +17,7 @@ pub enum Column {
     Bool(Vec<bool>),
     /// For [`Dtype::String`].
     Text(Vec<String>),
-    /// For [`Dtype::Image`]: a PNG file a row, and for [`Dtype::Video`] what its decoded frames are turned into.
+    /// For [`Dtype::Image`]: a PNG file per row, and for [`Dtype::Video`] what its decoded frames are turned into.
     Png(Vec<Vec<u8>>),
 }
 

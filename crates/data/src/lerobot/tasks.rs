@@ -1,7 +1,8 @@
 //! `meta/tasks.parquet`: what was to be done, in words.
 
 use super::feature::{Dtype, Feature};
-use super::parquet_file::{ParquetFile, ParquetWriter};
+use super::parquet_file::ParquetFile;
+use super::parquet_writer::ParquetWriter;
 use super::table::Column;
 use crate::Result;
 use crate::file::file_error;

@@ -537,7 +537,8 @@ fn a_foreign_column_type_is_named_with_its_column() {
 
 /// Replaces columns of a file of a dataset, as another program would: the checksums are right.
 fn replace(path: &Path, columns: Vec<(&str, arrow_array::ArrayRef)>) {
-    use super::parquet_file::{ParquetFile, replace_columns};
+    use super::arrow::replace_columns;
+    use super::parquet_file::ParquetFile;
     let file = ParquetFile::open(path).unwrap();
     let rows = file.rows();
     let change = &mut |batch: &arrow_array::RecordBatch, first| {
@@ -570,7 +571,7 @@ fn what_is_stale_is_taken_anew_from_the_rows() {
         replace(&data_file(root, 1), columns);
     };
     let statistics: Change = &|root| {
-        let stale = super::parquet_file::lists(integers([7, 7]), 1);
+        let stale = super::arrow::lists(integers([7, 7]), 1);
         replace(&root.join(list), vec![("stats/episode_index/min", stale)]);
     };
     let late: Change = &|root| {

@@ -12,6 +12,12 @@ use std::process::{Command, Stdio};
 /// Names the decoder when it is not called `ffmpeg` or not on the path.
 const PROGRAM: &str = "E2H_FFMPEG";
 
+/// The program that decodes videos: `ffmpeg`, or what `E2H_FFMPEG` names.
+#[must_use]
+pub fn video_decoder() -> OsString {
+    std::env::var_os(PROGRAM).filter(|p| !p.is_empty()).unwrap_or_else(|| "ffmpeg".into())
+}
+
 fn prefixed(prefix: &str, path: &Path) -> OsString {
     let mut whole = OsString::from(prefix);
     whole.push(path);
@@ -29,7 +35,7 @@ pub(crate) fn read(
     let Some((height, width)) = feature.image_size() else { return Ok(vec![]) };
     // Half a frame early, so that rounding of times does not skip the first frame.
     let start = (from - 0.5 / fps).max(0.0);
-    let program = std::env::var_os(PROGRAM).filter(|p| !p.is_empty()).unwrap_or_else(|| "ffmpeg".into());
+    let program = video_decoder();
     let failed = |found: String| Error::Video {
         path: path.to_owned(),
         needs: "the program `ffmpeg`, 5.1 or newer (or the one that E2H_FFMPEG names), to decode it",

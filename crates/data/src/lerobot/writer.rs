@@ -1,7 +1,9 @@
+use super::arrow::{batch, to_arrow};
 use super::dataset::{Dataset, info_path};
 use super::episodes::{self, Entry, EpisodeSpan};
-use super::feature::{DEFAULT_FEATURES, Dtype, Features, INSIDE, Info};
-use super::parquet_file::{ParquetWriter, batch, to_arrow};
+use super::feature::{DEFAULT_FEATURES, Dtype, Features};
+use super::info::{INSIDE, Info};
+use super::parquet_writer::ParquetWriter;
 use super::stats::{self, Stats};
 use super::table::{Column, Table, column_error};
 use super::tasks;
@@ -176,7 +178,7 @@ impl Writer {
         if full { self.commit() } else { Ok(()) }
     }
 
-    /// Makes all episodes pushed so far part of the dataset. After each episode it costs a file an episode, which is what
+    /// Makes all episodes pushed so far part of the dataset. After each episode it costs a file per episode, which is what
     /// recording on a robot wants; otherwise files fill up first.
     ///
     /// # Errors
@@ -230,7 +232,7 @@ impl Writer {
         let count =
             |n: usize| i64::try_from(n).map_err(|_| column_error("index", "below 2^63", n.to_string()));
         let (first, index, task) = (count(from)?, count(index)?, count(task)?);
-        #[allow(clippy::cast_possible_truncation, reason = "the format says 32 bits")]
+        // The format says 32 bits.
         let time = |t: usize| (t as f64 / self.info.fps) as f32;
         let mut columns = table.columns.clone();
         for (name, _) in DEFAULT_FEATURES {

@@ -4,7 +4,7 @@ use crate::expert::{draw, scatter};
 use crate::mjcf::{Ring, feet};
 use crate::pick_place::{Stand, Turn, down, ordered, pick_place};
 use crate::tabletop::{beside, in_disk, lean, left_alone, turn};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose, finer};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -36,7 +36,7 @@ const LAID: (f64, f64) = (0.025, 15.0 * PI / 180.0);
 const LEAN_BACK: f64 = PI / 4.0;
 
 /// The pair `brush`. Hard: a brush goes from its cradle, where it lies, into its holder, where it stands. Easy: it goes back.
-/// On the way the hand turns by a quarter. Default clearance 3 mm a side.
+/// On the way the hand turns by a quarter. Default clearance 3 mm per side.
 ///
 /// # Source
 /// A twin of the paper's real pair; sizes are ours.
@@ -49,6 +49,7 @@ pub struct Brush {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "brush",
+    config: include_str!("../../../../configs/tasks/brush.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.003, range: [0.001, 0.006] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(Brush { clearance, demonstrator }),

@@ -3,7 +3,7 @@
 use crate::expert::{draw, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
 use crate::tabletop::{Region, beside, left_alone, near_middle, tilt, turn};
-use crate::task::{Choice, Entry, STANDARD};
+use crate::tasks::{Choice, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
@@ -40,6 +40,7 @@ pub struct CubePickPlace {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "cube_pick_place",
+    config: include_str!("../../../../configs/tasks/cube_pick_place.toml"),
     variants: &STANDARD,
     clearance: None,
     build: |Choice { demonstrator, .. }| Arc::new(CubePickPlace { demonstrator }),

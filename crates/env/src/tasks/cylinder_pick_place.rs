@@ -4,7 +4,7 @@ use crate::expert::{draw, scatter};
 use crate::mjcf::{Ring, feet};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
 use crate::tabletop::{Region, beside, in_disk, left_alone, tilt, turn};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
@@ -28,7 +28,7 @@ const GRASP: f64 = 0.022;
 const YAW: f64 = 0.5;
 
 /// The pair `cylinder_pick_place`. Hard: a cylinder goes from the table into a ring that it stands in. Easy: it comes out
-/// and back. Default clearance 4 mm a side.
+/// and back. Default clearance 4 mm per side.
 ///
 /// # Source
 /// The paper's Isaac pair; sizes are ours.
@@ -41,6 +41,7 @@ pub struct CylinderPickPlace {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "cylinder_pick_place",
+    config: include_str!("../../../../configs/tasks/cylinder_pick_place.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.004, range: [0.001, 0.012] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(CylinderPickPlace { clearance, demonstrator }),

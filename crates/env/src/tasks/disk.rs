@@ -4,7 +4,7 @@ use crate::expert::{draw, scatter};
 use crate::mjcf::{Ring, feet};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
 use crate::tabletop::{Region, beside, in_disk, left_alone, tilt, turn};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
@@ -30,7 +30,7 @@ const SIDES: u32 = 12;
 
 /// The pair `disk`. Hard: a disk goes from the table over a rod and down. Easy: it comes off and back to the table.
 ///
-/// The hole is the rod's radius and the clearance (default 4 mm a side) wide. The disk is as wide as the hand opens, so it
+/// The hole is the rod's radius and the clearance (default 4 mm per side) wide. The disk is as wide as the hand opens, so it
 /// has a hub round its hole to be held by.
 ///
 /// # Source
@@ -44,6 +44,7 @@ pub struct Disk {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "disk",
+    config: include_str!("../../../../configs/tasks/disk.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.004, range: [0.001, 0.006] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(Disk { clearance, demonstrator }),

@@ -3,7 +3,7 @@
 use crate::expert::{draw, gauss, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place, yaw_of};
 use crate::tabletop::{Region, beside, left_alone, near_middle, near_straight, tilt, turn};
-use crate::task::{Choice, Entry, STANDARD};
+use crate::tasks::{Choice, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
@@ -38,6 +38,7 @@ pub struct Mouse {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "mouse",
+    config: include_str!("../../../../configs/tasks/mouse.toml"),
     variants: &STANDARD,
     clearance: None,
     build: |Choice { demonstrator, .. }| Arc::new(Mouse { demonstrator }),

@@ -6,7 +6,7 @@ mod variant;
 use crate::expert::draw;
 use crate::pick_place::down;
 use crate::tabletop::Region;
-use crate::task::{Choice, Entry};
+use crate::tasks::{Choice, Entry};
 use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
@@ -24,8 +24,8 @@ const SEAT: (f64, f64) = (0.03, 0.05);
 
 /// The pair `nut_assembly`. Hard: the nut goes from the table over the peg. Easy: it comes off and back to the table.
 ///
-/// Variants: `loose` (the round nut of the released TR-DRL scene, about 47 mm a side), `round` and `square` (robosuite's
-/// own, 16 and 7 mm a side).
+/// Variants: `loose` (the round nut of the released TR-DRL scene, about 47 mm per side), `round` and `square` (robosuite's
+/// own, 16 and 7 mm per side).
 ///
 /// # Source
 /// TR-DRL (arXiv 2505.13925) and robosuite's pegs arena: shapes, start boxes and predicates.
@@ -42,6 +42,7 @@ pub struct NutAssembly {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "nut_assembly",
+    config: include_str!("../../../../configs/tasks/nut_assembly.toml"),
     variants: &VARIANTS,
     clearance: None,
     build: |c| Arc::new(NutAssembly::new(c)),

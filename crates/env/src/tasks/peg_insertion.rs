@@ -4,7 +4,7 @@ use crate::expert::{draw, gauss};
 use crate::pick_place::{GENTLE, down};
 use crate::scene::{compose_two_arms, finer};
 use crate::tabletop::{in_disk, lean};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -41,7 +41,7 @@ const START: ([f64; 2], f64) = ([-0.04, 0.04], 0.04);
 /// home. There are no grippers; the second arm only holds the plate, and what the state calls the object is the hole.
 ///
 /// # Source
-/// robosuite's `TwoArmPegInHole` and TR-DRL's `TwoArmPegRemoval`: sizes (default clearance 30 mm a side) and predicates.
+/// robosuite's `TwoArmPegInHole` and TR-DRL's `TwoArmPegRemoval`: sizes (default clearance 30 mm per side) and predicates.
 /// Differs: the peg's radius is fixed; the hole's middle is that of its opening (robosuite's is 10 mm off); the peg starts 45
 /// degrees off the hole's axis (there 90), within reach of two Pandas side by side; starts are spread by 40 mm, over the
 /// states in which the easy task ends.
@@ -54,6 +54,7 @@ pub struct PegInsertion {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "peg_insertion",
+    config: include_str!("../../../../configs/tasks/peg_insertion.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.03, range: [0.005, 0.06] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(PegInsertion { clearance, demonstrator }),

@@ -4,7 +4,7 @@ use crate::expert::{draw, scatter};
 use crate::mjcf::Ring;
 use crate::pick_place::{GENTLE, Symmetry, carry, down, from_above, upright};
 use crate::tabletop::{Region, in_disk, lean, tilt, turn};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Phase, Result, Script, Sim, TableCamera, Task, compose, finer};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
@@ -37,10 +37,10 @@ const START_YAW: f64 = 0.4;
 /// The pair `rod_insertion`. Hard: a rod goes into a hole. Easy: it comes out, to a random pose of the start region. The hand
 /// holds it throughout: a dropped rod ends the episode.
 ///
-/// The rod's ends are round, which stands for the chamfer that such pegs have. Default clearance 2 mm a side.
+/// The rod's ends are round, which stands for the chamfer that such pegs have. Default clearance 2 mm per side.
 ///
 /// # Source
-/// The paper's Isaac pair; sizes are ours (Factory's peg has 0.06 mm a side, which a position-controlled arm cannot meet).
+/// The paper's Isaac pair; sizes are ours (Factory's peg has 0.06 mm per side, which a position-controlled arm cannot meet).
 #[derive(Debug, Clone)]
 pub struct RodInsertion {
     clearance: f64,
@@ -50,6 +50,7 @@ pub struct RodInsertion {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "rod_insertion",
+    config: include_str!("../../../../configs/tasks/rod_insertion.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.002, range: [0.0005, 0.01] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(RodInsertion { clearance, demonstrator }),

@@ -4,7 +4,7 @@ use crate::expert::{draw, scatter};
 use crate::mjcf::{Ring, feet};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
 use crate::tabletop::{beside, in_disk, lean, left_alone, tilt, turn};
-use crate::task::{Choice, Clearance, Entry, STANDARD};
+use crate::tasks::{Choice, Clearance, Entry, STANDARD};
 use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
@@ -23,7 +23,7 @@ struct Hole {
 }
 const RACK: Hole = Hole { at: [0.62, 0.10], rim: 0.06, floor: 0.01 };
 const STAND: Hole = Hole { at: [0.52, -0.12], rim: 0.03, floor: 0.006 };
-/// Free space round the tube in the stand, m a side.
+/// Free space round the tube in the stand, m per side.
 const STAND_PLAY: f64 = 0.008;
 /// How far below the rack's rim the tube's bottom has to be, m.
 const INSERTED: f64 = 0.03;
@@ -34,7 +34,7 @@ const YAW: f64 = 0.5;
 
 /// The pair `test_tube`. Hard: a tube goes from a loose stand into a rack. Easy: it comes out and back into the stand.
 ///
-/// The tube's bottom is flat, so that it can stand by itself where there is room to lean. Default clearance 3 mm a side.
+/// The tube's bottom is flat, so that it can stand by itself where there is room to lean. Default clearance 3 mm per side.
 ///
 /// # Source
 /// A twin of the paper's real pair; sizes are ours.
@@ -47,6 +47,7 @@ pub struct TestTube {
 /// The registry's line.
 pub(crate) const ENTRY: Entry = Entry {
     name: "test_tube",
+    config: include_str!("../../../../configs/tasks/test_tube.toml"),
     variants: &STANDARD,
     clearance: Some(Clearance { default: 0.003, range: [0.001, 0.006] }),
     build: |Choice { clearance, demonstrator, .. }| Arc::new(TestTube { clearance, demonstrator }),

@@ -3,9 +3,10 @@
 use super::{Files, Publication, read_if_there};
 use crate::config::RunConfig;
 use crate::directory::io;
-use crate::record::RunResults;
+use crate::record::{RunResults, parse_results};
 use crate::report::chart;
 use crate::{Error, Result};
+use e2h_core::Direction;
 use e2h_policy::{Checkpoint, Provenance};
 use std::path::Path;
 use toml::{Table, Value};
@@ -39,23 +40,11 @@ pub(super) fn files(publication: &Publication) -> Result<Files> {
     Ok(files)
 }
 
-/// A `results.json`: of one run, or of several seeds as our checkpoints have it.
-#[derive(serde::Deserialize)]
-struct Several {
-    runs: Vec<RunResults>,
-}
-
 /// What was measured, and the text that says so: beside the checkpoint, or where a run directory has it.
 fn results(dir: &Path) -> Result<Option<(Vec<RunResults>, String)>> {
     for path in [dir.join("results.json"), dir.join("../../results.json")] {
         let Some(text) = read_if_there(&path)? else { continue };
-        let several = serde_json::from_str::<serde_json::Value>(&text).is_ok_and(|v| v.get("runs").is_some());
-        let runs = if several {
-            serde_json::from_str::<Several>(&text).map(|s| s.runs)
-        } else {
-            serde_json::from_str(&text).map(|run| vec![run])
-        };
-        let runs = runs.map_err(|e| Error::Foreign {
+        let runs = parse_results(&text).map_err(|e| Error::Foreign {
             path,
             quantity: "file".to_owned(),
             expected: "results of runs of this version".to_owned(),
@@ -81,7 +70,7 @@ pub fn model_card(
 ) -> String {
     let p = provenance;
     let measured = results.and_then(|r| r.iterations.iter().find(|i| i.iteration == p.iteration));
-    let measured = measured.filter(|_| p.direction == "hard").map(|i| &i.evaluation);
+    let measured = measured.filter(|_| p.direction == Some(Direction::Hard)).map(|i| &i.evaluation);
     let mut card = "---\n".to_owned();
     if let Some(license) = license {
         card += &format!("license: {}\n", quoted(license));
@@ -103,7 +92,7 @@ pub fn model_card(
     card += &format!(
         "A diffusion policy for the {} task of `{}`, learned from time-reversed demonstrations of the task that undoes it \
          with Auto-E2H {}.\n\n",
-        plain(&p.direction),
+        p.direction.map_or("", Direction::name),
         plain(&p.task),
         plain(&p.version)
     );
@@ -119,7 +108,11 @@ pub fn model_card(
     card += "| iteration | successes | Wilson 95 % | minutes |\n|---|---|---|---|\n";
     for i in &results.iterations {
         let e = &i.evaluation;
-        let this = if i.iteration == p.iteration && p.direction == "hard" { " (this policy)" } else { "" };
+        let this = if i.iteration == p.iteration && p.direction == Some(Direction::Hard) {
+            " (this policy)"
+        } else {
+            ""
+        };
         card += &format!(
             "| {}{this} | {} of {} | {:.0} to {:.0} % | {:.1} |\n",
             i.iteration,
@@ -178,19 +171,45 @@ fn differences(standard: &Table, this: &Table, path: &str, out: &mut Vec<String>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::sample;
+    use crate::record::{Evaluation, IterationRecord, wilson95};
 
     fn provenance(set: &[&str]) -> Provenance {
         let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
         let config = RunConfig::resolve("laptop", "nut_assembly", &set).unwrap().config;
         Provenance {
             task: "nut_assembly".to_owned(),
-            direction: "hard".to_owned(),
+            direction: Some(Direction::Hard),
             preset: "laptop".to_owned(),
             seed: 7,
             iteration: 2,
             version: "0.1.0".to_owned(),
             run: serde_json::to_value(config).unwrap(),
+        }
+    }
+
+    /// Made-up results.
+    fn results(successes: &[usize]) -> RunResults {
+        let row = |(i, &k): (usize, &usize)| IterationRecord {
+            iteration: u32::try_from(i).unwrap(),
+            evaluation: Evaluation {
+                successes: k,
+                trials: 50,
+                wilson95: wilson95(k, 50),
+                mean_steps: 200.0,
+                seconds: 80.0,
+            },
+            minutes: 11.0 + 14.3 * i as f64,
+            stage_minutes: [("train".to_owned(), 7.5)].into(),
+            collection: None,
+            loss: 0.04,
+            skipped: false,
+        };
+        RunResults {
+            task: "nut_assembly".to_owned(),
+            preset: "laptop".to_owned(),
+            seed: 7,
+            iterations: successes.iter().enumerate().map(row).collect(),
+            ..RunResults::default()
         }
     }
 
@@ -211,7 +230,7 @@ mod tests {
 
     #[test]
     fn the_card_has_front_matter_curve_and_command() {
-        let results = sample::results(7, 4);
+        let results = results(&[1, 9, 22, 28]);
         let address = "lab/nut".parse().unwrap();
         let card = model_card(&address, &provenance(&[]), Some(&results), Some("mit"));
         let mut parts = card.splitn(3, "---\n");

@@ -16,7 +16,7 @@ pub use card::{command, model_card};
 pub const SCHEME: &str = "hf://";
 /// The branch that is meant when none is named.
 pub const MAIN: &str = "main";
-/// Said to who asks a build without the client for the hub.
+/// The problem that a build without the client reports.
 #[cfg(not(feature = "hub"))]
 const WITHOUT: &str = "this build has no hub client; build with `--features hub`";
 

@@ -47,7 +47,7 @@ pub(crate) fn under(g: &Geo, device: &Device) -> Result<Gather> {
     cached(Kind::Under, g, device)
 }
 
-/// For every input position the output rows that it has a part in, one a tap.
+/// For every input position the output rows that it has a part in, one per tap.
 pub(crate) fn over(g: &Geo, device: &Device) -> Result<Gather> {
     cached(Kind::Over, g, device)
 }

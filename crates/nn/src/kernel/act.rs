@@ -140,7 +140,7 @@ fn film_sizes(x: &[f32], e: &[f32], size: usize, c: usize) {
     debug_assert_eq!(x.len() * 2 * c, e.len() * size, "samples of x and pairs of scale and shift");
 }
 
-/// `x` of rows of `c`, `steps` rows a sample; `e` holds scale and shift of each sample.
+/// `x` of rows of `c`, `steps` rows per sample; `e` holds scale and shift of each sample.
 pub(crate) fn film_forward(x: &[f32], e: &[f32], steps: usize, c: usize) -> Vec<f32> {
     let size = steps * c;
     film_sizes(x, e, size, c);

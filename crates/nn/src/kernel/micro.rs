@@ -48,6 +48,17 @@ impl Isa {
         all
     }
 
+    /// What people call it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => "AVX-512",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => "AVX2 and FMA",
+            Self::Plain => "what every processor of this kind has",
+        }
+    }
+
     /// Numbers in a register.
     pub(super) fn lanes(self) -> usize {
         match self {

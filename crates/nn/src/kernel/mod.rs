@@ -109,6 +109,12 @@ pub(crate) fn has_avx2() -> bool {
     }
 }
 
+/// The vector instructions that this processor has and the kernels use, in words.
+#[must_use]
+pub fn vector_unit() -> &'static str {
+    micro::Isa::best().name()
+}
+
 /// `a * b + c`, in one instruction where the processor has it.
 #[inline(always)]
 pub(crate) fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {

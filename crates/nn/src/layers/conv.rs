@@ -1,7 +1,7 @@
+use crate::builder::{Builder, Init, Weight};
 use crate::graph;
 use crate::kernel::column_sums;
 use crate::kernel::conv::{self, Geo};
-use crate::params::{Builder, Init, Weight};
 use crate::tape::{Flow, Node, Step, Tape, Values, read, run};
 use crate::{Error, Result};
 use candle_core::Tensor;

@@ -1,6 +1,6 @@
 use super::conv::Convolution;
+use crate::builder::{Builder, Init, Weight};
 use crate::kernel::conv::Geo;
-use crate::params::{Builder, Init, Weight};
 use crate::tape::{Node, Tape, run};
 use crate::{Error, Result};
 use candle_core::Tensor;

@@ -1,6 +1,6 @@
+use crate::builder::{Builder, Init, Weight};
 use crate::graph;
 use crate::kernel::norm::{self, Dims, Post, Saved};
-use crate::params::{Builder, Init, Weight};
 use crate::tape::{Flow, Node, Read, Step, Tape, Values, read, run};
 use crate::{Error, Result};
 use candle_core::Tensor;

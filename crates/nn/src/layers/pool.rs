@@ -1,7 +1,7 @@
 use super::Conv2d;
+use crate::builder::Builder;
 use crate::graph;
 use crate::kernel::pool::{self, Map};
-use crate::params::Builder;
 use crate::tape::{Flow, Node, Step, Tape, Values, run};
 use crate::weights::HostTensor;
 use crate::{Error, Result};

@@ -59,7 +59,7 @@ impl AdamConfig {
                 return fail(what, "a number in [0, 1)", beta);
             }
         }
-        // At 0 a weight whose gradient has always been 0 is divided by 0.
+        // At 0 a weight whose gradient has always been 0 would change by 0 / 0.
         if !(self.eps > 0.0 && self.eps <= 1.0) {
             return fail("eps", "more than 0 and at most 1", self.eps);
         }

@@ -265,7 +265,7 @@ pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
         format!("a multiple of {multiple} for {} levels", c.down_dims.len()),
         c.horizon.to_string(),
     );
-    #[allow(clippy::float_cmp, reason = "any other weight is guidance")]
+    // Any other weight is guidance.
     let unguided = c.guidance == 1.0;
     ask(unguided, "guidance", "1".to_owned(), c.guidance.to_string());
     // torchvision rounds half a pixel to the even number, we round it down: every fourth difference has another centre.

@@ -6,7 +6,7 @@ use super::fold;
 use super::policy::LerobotPolicy;
 use super::processors::{POSTPROCESSOR, PREPROCESSOR, Statistics};
 use super::{ACTION, CONFIG_FILE, ENVIRONMENT, POSITION_GRID, STATE, WEIGHTS_FILE};
-use crate::checkpoint::read_weights_without;
+use crate::folder::read_weights_without;
 use crate::model::{DiffusionModel, Widths};
 use crate::{Ddim, EncoderNorm, Error, ImageScaling, PolicyConfig, Prediction, Result, SamplerKind};
 use e2h_nn::{SpatialSoftmax, Weights};
@@ -216,7 +216,7 @@ fn network(d: &Description, features: &Features, problems: &mut Vec<Obstacle>) -
     ask(d.use_film_scale_modulation, "use_film_scale_modulation", "true", "false".to_owned());
     let schedule = "squaredcos_cap_v2";
     ask(d.beta_schedule == schedule, "beta_schedule", schedule, d.beta_schedule.clone());
-    #[allow(clippy::float_cmp, reason = "any other limit clips elsewhere")]
+    // Any other limit clips elsewhere.
     let clipped = d.clip_sample && d.clip_sample_range == 1.0;
     let found = format!("{} and {}", d.clip_sample, d.clip_sample_range);
     ask(clipped, "clip_sample and clip_sample_range", "true and 1", found);

@@ -18,7 +18,7 @@ pub struct LerobotObservation {
     pub state: Vec<f32>,
     /// `observation.environment_state`; empty for a policy without it.
     pub environment: Vec<f32>,
-    /// One image a camera, in the order of [`LerobotPolicy::cameras`].
+    /// One image per camera, in the order of [`LerobotPolicy::cameras`].
     pub images: Vec<Image>,
 }
 

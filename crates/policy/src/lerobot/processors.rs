@@ -187,7 +187,7 @@ impl Statistics {
                 vec![1.0; width]
             })
         };
-        #[allow(clippy::cast_possible_truncation, reason = "statistics are 32 bits, in LeRobot too")]
+        // Statistics are 32 bits, in LeRobot too.
         let eps = s.eps as f32;
         match s.norm_map.get(kind).map_or("IDENTITY", String::as_str) {
             "IDENTITY" => Scaling::None,

@@ -84,7 +84,7 @@ impl Config {
 }
 
 /// Frames at `fps` that take as long as `n` at 20 Hz.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a positive number of frames")]
+// A positive number of frames.
 fn frames(n: usize, fps: f64) -> usize {
     (n as f64 * fps / 20.0).round() as usize
 }
@@ -173,7 +173,7 @@ impl CriticSettings {
         }
     }
 
-    #[allow(clippy::cast_possible_truncation, reason = "small settings, kept as they are written")]
+    // Small settings, kept as they are written.
     pub(crate) fn training(&self) -> CriticConfig {
         CriticConfig {
             crop_size: self.crop_size,

@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail, ensure};
 use e2h_core::{Direction, Episode, Frames, Kind, Origin, Outcome, align_hemisphere};
 use e2h_data::lerobot::{Dataset, Dtype, Feature, Info, RobotColumns, Table, decode_png};
 use e2h_data::{Normaliser, NormaliserConfig, resize_image};
-use e2h_policy::{Critic, CriticProvenance, train_critic};
+use e2h_policy::{Critic, CriticProvenance, CriticTraining, train_critic};
 use e2h_refine::{critic_filter, resample};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -130,7 +130,7 @@ impl Stage {
         let network = settings.network(&names, source.columns.object.is_some());
         network.validate()?;
         let training = settings.training();
-        #[allow(clippy::cast_possible_truncation, reason = "a small share")]
+        // A small share.
         let scaling = NormaliserConfig { margin: settings.margin as f32, ..NormaliserConfig::default() };
         let normaliser = Normaliser::fit(&rollouts, &scaling)?;
         let horizon = config.advantage_at(a.fps).horizon;
@@ -142,18 +142,18 @@ impl Stage {
             }
             std::ops::ControlFlow::Continue(())
         };
-        let (critic, report) = train_critic(
-            &network,
-            &training,
-            &e2h_nn::Compute::cpu(),
-            &normaliser,
-            &none,
-            &rollouts,
+        let settings = CriticTraining {
+            policy: &network,
+            critic: &training,
+            compute: &e2h_nn::Compute::cpu(),
+            normaliser: &normaliser,
+            policy_weights: &none,
+            rollouts: &rollouts,
             horizon,
             seed,
-            "critic",
-            progress,
-        )?;
+            purpose: "critic",
+        };
+        let (critic, report) = train_critic(&settings, progress)?;
         let about = CriticProvenance {
             inputs: inputs(hard.info(), source, a.fps, config)?,
             reference_quaternion: config.reverse.reference_quaternion,
@@ -241,7 +241,7 @@ impl Judge {
             for start in [3, 10] {
                 let q = std::array::from_fn(|i| f64::from(state[start + i]));
                 let q = align_hemisphere(q, &self.about.reference_quaternion);
-                #[allow(clippy::cast_possible_truncation, reason = "states are 32 bits")]
+                // States are 32 bits.
                 state[start..start + 4].copy_from_slice(&q.map(|v| v as f32));
             }
         }

@@ -30,7 +30,10 @@ use std::path::PathBuf;
 
 /// Reverses and filters a dataset of easy-direction episodes.
 #[derive(Parser)]
-#[command(version)]
+#[command(
+    version,
+    after_help = "Example:\n  cargo run --release --example refine -- --dataset recordings/unplug --out refined/plug_in \\\n      --pose observation.state[0:7] --rotation wxyz --gripper observation.state[7] --gripper-range 0,0.08 \\\n      --task \"plug it in\""
+)]
 struct Arguments {
     /// LeRobotDataset v3.0 with episodes of the easy task.
     #[arg(long, value_name = "DIR")]
@@ -340,7 +343,7 @@ fn table(
         if a.gripper.is_some() {
             state.push(segment.opening(t));
         }
-        #[allow(clippy::cast_possible_truncation, reason = "observation.state is 32 bits")]
+        // `observation.state` is 32 bits.
         for column in &further {
             let values = column.get(row).with_context(|| format!("row {row}"))?;
             state.extend(values.iter().map(|&v| v as f32));

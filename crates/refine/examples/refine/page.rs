@@ -6,7 +6,7 @@ use crate::{Arguments, LeftOut, Plan};
 use anyhow::Result;
 use e2h_core::Episode;
 use e2h_data::lerobot::Info;
-use e2h_refine::{Fate, RefineReport, Refined};
+use e2h_refine::{RefineReport, Refined};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::fmt::{self, Display, Formatter};
@@ -114,18 +114,6 @@ impl Account {
     }
 }
 
-pub(crate) fn fate_name(fate: Fate) -> &'static str {
-    match fate {
-        Fate::Kept => "kept",
-        Fate::Static => "static",
-        Fate::Resampled => "resampled",
-        Fate::LowAdvantage => "low_advantage",
-        Fate::DynamicsError => "dynamics_error",
-        Fate::TooShort => "too_short",
-        Fate::AfterGoal => "after_goal",
-    }
-}
-
 /// Fate of every frame of every reversed recording.
 pub(crate) fn csv(plans: &[Plan], fps: f64) -> String {
     let mut out = String::from("episode,frame,time_s,source_frame,speed_m_s,value,advantage,fate\n");
@@ -133,7 +121,7 @@ pub(crate) fn csv(plans: &[Plan], fps: f64) -> String {
         for t in 0..plan.reversed.len() {
             let (speed, fate) = match &plan.refined {
                 // The filter counts 20 frames a second.
-                Some(r) => (format!("{:.5}", f64::from(r.speed[t]) * fps / 20.0), fate_name(r.fates[t])),
+                Some(r) => (format!("{:.5}", f64::from(r.speed[t]) * fps / 20.0), r.fates[t].name()),
                 None => (String::new(), "rejected"),
             };
             let time = t as f64 / fps;

@@ -2,7 +2,7 @@
 
 use crate::Plan;
 use crate::config::Config;
-use crate::page::{escape, fate_name};
+use crate::page::escape;
 use e2h_core::Episode;
 use e2h_data::lerobot::Table;
 use e2h_refine::{Fate, Refined};
@@ -91,7 +91,7 @@ pub(crate) fn svg(plan: &Plan, recording: &Table, camera: Option<&str>, config: 
         .map(|(i, f)| (i, f, plan.refined.as_ref().map_or(0, |r| r.report.count(f))))
         // The critic's fates where it has spoken.
         .filter(|&(i, _, n)| i < 3 || n > 0)
-        .map(|(_, f, n)| format!("{n} {}", fate_name(f)))
+        .map(|(_, f, n)| format!("{n} {}", f.name()))
         .collect();
     let what = match &plan.refined {
         Some(_) => format!("{rows} frames: {}", counts.join(", ")),

@@ -31,7 +31,7 @@ fn a_pause_of_more_than_16_frames_keeps_its_first_and_last() {
 
 #[test]
 fn a_creeping_run_is_split_where_it_has_drifted_too_far() {
-    // 1.9 mm a frame pass 50 mm with the 27th step: pieces of 27, 27 and 6 frames, of which 25 + 25 go.
+    // 1.9 mm per frame pass 50 mm with the 27th step: pieces of 27, 27 and 6 frames, of which 25 + 25 go.
     let refined = filter(&along(&walk(&[(60, 0.0019), (10, 0.01)])), &KinematicConfig::default());
     assert_eq!(refined.report.still, 50);
     assert_eq!(refined.fates[25..29], [Fate::Static, Fate::Kept, Fate::Kept, Fate::Static]);
@@ -62,7 +62,7 @@ fn a_grasp_survives_except_to_the_letter() {
 
 #[test]
 fn the_object_does_not_jump_at_a_splice() {
-    // It falls 3 cm within a pause of 60 frames, at 3 mm a frame.
+    // It falls 3 cm within a pause of 60 frames, at 3 mm per frame.
     let mut e = along(&[0.0; 60]);
     for (t, s) in e.state.iter_mut().enumerate() {
         s[9] = -0.003 * (t as f32 - 30.0).clamp(0.0, 10.0);

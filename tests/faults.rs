@@ -192,6 +192,7 @@ fn a_flipped_bit_in_what_a_run_reads_again_is_told_by_file_name() {
         out.join("iteration_00/record.json"),
         out.join("iteration_00/policy/notes.json"),
         out.join("iteration_01/segments/notes.json"),
+        out.join("iteration_01/segments/files.json"),
     ] {
         let whole = std::fs::read(&path).unwrap();
         // A digit, so that JSON stays JSON.
@@ -206,17 +207,19 @@ fn a_flipped_bit_in_what_a_run_reads_again_is_told_by_file_name() {
         std::fs::write(&path, whole).unwrap();
     }
     // The seal itself: its digest, and its name, without which the file would look like one that has none.
-    let notes = out.join("policy_easy/notes.json");
-    let whole = std::fs::read_to_string(&notes).unwrap();
-    for damaged in
-        [whole.replacen("sha256", "sha254", 1), whole.replacen("\"sha256\": \"", "\"sha256\": \"f", 1)]
-    {
-        std::fs::write(&notes, &damaged).unwrap();
-        let output = nut_assembly(&out, &["--resume"]).output().unwrap();
-        let words = text(&output.stderr);
-        assert!(!output.status.success() && words.contains(notes.to_str().unwrap()), "{words}");
+    for sealed in ["policy_easy/notes.json", "iteration_01/segments/files.json"] {
+        let sealed = out.join(sealed);
+        let whole = std::fs::read_to_string(&sealed).unwrap();
+        for damaged in
+            [whole.replacen("sha256", "sha254", 1), whole.replacen("\"sha256\": \"", "\"sha256\": \"f", 1)]
+        {
+            std::fs::write(&sealed, &damaged).unwrap();
+            let output = nut_assembly(&out, &["--resume"]).output().unwrap();
+            let words = text(&output.stderr);
+            assert!(!output.status.success() && words.contains(sealed.to_str().unwrap()), "{words}");
+        }
+        std::fs::write(&sealed, whole).unwrap();
     }
-    std::fs::write(&notes, whole).unwrap();
     let files = results_of(&out);
     assert_success(&nut_assembly(&out, &["--resume"]).output().unwrap());
     // To the last digit of every number that was read and written again.

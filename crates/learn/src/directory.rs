@@ -6,9 +6,7 @@ use crate::{Error, Result};
 use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use e2h_env::Task;
-use e2h_report::folder::{
-    IDENTITY_FILE, Identity, LAYOUT, SUMS_FILE as FILES, compare, read_json, sealed, sha256,
-};
+use e2h_report::folder::{IDENTITY_FILE, Identity, LAYOUT, SUMS_FILE, compare, read_json, sealed, sha256};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::borrow::Borrow;
@@ -300,7 +298,7 @@ impl Directory {
         self.put(&format!("{beside_name}/{NOTES}"), notes)?;
         let mut sums = BTreeMap::new();
         self.sums(&beside_name, "", &mut sums)?;
-        self.put(&format!("{beside_name}/{FILES}"), &sums)?;
+        self.put_sealed(&format!("{beside_name}/{SUMS_FILE}"), &sums)?;
         std::fs::rename(&beside, &place).map_err(io("renaming to", &place))?;
         sync(place.parent().unwrap_or(Path::new(".")))
     }
@@ -308,8 +306,17 @@ impl Directory {
     /// Reads what [`Directory::put_episodes`] wrote, every byte of it verified; none when it is not there.
     pub(crate) fn get_episodes<T: DeserializeOwned>(&self, name: &str) -> Result<Option<(Vec<Episode>, T)>> {
         // Runs of version 0.1 have no sums.
-        let sums: Option<BTreeMap<String, String>> = self.get(&format!("{name}/{FILES}"))?;
+        let sums: Option<BTreeMap<String, String>> = self.get(&format!("{name}/{SUMS_FILE}"))?;
         for (file, sum) in sums.iter().flatten() {
+            // Without its seal the list may be what is damaged.
+            if !self.join(format!("{name}/{file}")).exists() {
+                return Err(Error::Foreign {
+                    path: self.join(format!("{name}/{SUMS_FILE}")),
+                    quantity: "list".to_owned(),
+                    expected: "files that are there".to_owned(),
+                    found: e2h_core::one_line(file),
+                });
+            }
             self.verify(&format!("{name}/{file}"), Some(sum))?;
         }
         let Some(notes) = self.get(&format!("{name}/{NOTES}"))? else { return Ok(None) };

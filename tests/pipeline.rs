@@ -3,6 +3,7 @@ use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
 use auto_e2h::learn::{Accepted, Collected, Json, Run, RunOptions};
 use auto_e2h::refine::Fate;
+use auto_e2h::report::folder::sealed;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -195,4 +196,29 @@ fn all_rollouts_are_kept_as_a_dataset_when_asked_for() {
     assert_eq!(kept.read_episode(1).unwrap().origin.direction, Direction::Easy);
     // The second collection of a resumed run leaves the dataset as it is.
     run.collect(1, &*hard, &*easy).unwrap();
+}
+
+#[test]
+fn minutes_of_a_stage_are_those_of_all_processes_that_worked_on_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options(&dir.path().join("run"));
+    options.set.push("train.initial_steps=2".to_owned());
+    let run = Run::open(&options).unwrap();
+    let demonstrations = run.demonstrations().unwrap();
+    options.stop.ask(15);
+    assert!(run.train_initial(&demonstrations).is_err(), "it was asked to stop");
+    // As if it had worked for long.
+    let spent = run.path().join("iteration_00/policy/training.json");
+    let text = std::fs::read_to_string(&spent).unwrap();
+    assert!(text.contains("\"minutes\""), "{text}");
+    std::fs::write(&spent, format!("{}\n", sealed("{\n  \"minutes\": 1000.0\n}"))).unwrap();
+    drop(run);
+
+    options.stop = auto_e2h::learn::Stop::default();
+    options.resume = true;
+    let run = Run::open(&options).unwrap();
+    let hard = run.train_initial(&demonstrations).unwrap();
+    let minutes = run.evaluate(0, &*hard, None).unwrap().stage_minutes["train"];
+    assert!((1000.0..1001.0).contains(&minutes), "{minutes}");
+    assert!(!spent.exists(), "left over");
 }

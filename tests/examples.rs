@@ -175,6 +175,33 @@ fn a_class_of_policies_from_outside_the_library_learns_in_the_loop_and_goes_on()
     let told = text(&output.stderr);
     assert!(!output.status.success() && told.contains("expected a policy of kind `diffusion`"), "{told}");
 
+    // Stopped where its first training state lies, and gone on from there, it ends with the same weights.
+    let mut child = example("own_policy")
+        .args(["--preset", "smoke", "--quiet", "--set", "train.save_every=20", "--out"])
+        .arg(dir.path().join("two"))
+        .spawn()
+        .unwrap();
+    let state = dir.path().join("two/policy_easy/training.safetensors");
+    while !state.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    child.kill().unwrap();
+    assert!(!child.wait().unwrap().success(), "it ended before it could be killed");
+    assert_success(&run("two", &["--resume"]));
+    for file in ["policy_easy/model.safetensors", "iteration_01/policy/model.safetensors"] {
+        let [one, two] = ["one", "two"].map(|d| std::fs::read(dir.path().join(d).join(file)).unwrap());
+        assert!(one == two, "{file}");
+    }
+
+    // Another program's policies are another run.
+    let output = example("nut_assembly")
+        .args(["--preset", "smoke", "--quiet", "--resume", "--set", "train.save_every=20", "--out"])
+        .arg(dir.path().join("one"))
+        .output()
+        .unwrap();
+    let told = text(&output.stderr);
+    assert!(!output.status.success() && told.contains("found nut_assembly smoke auto-e2h mlp"), "{told}");
+
     // A weight that was flipped is found when the run goes on, whatever the class.
     let weights = folder.join("model.safetensors");
     let mut bytes = std::fs::read(&weights).unwrap();

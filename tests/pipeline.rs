@@ -1,11 +1,14 @@
 use auto_e2h::core::{Direction, Kind, Origin, stream};
 use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
-use auto_e2h::learn::{Accepted, Collected, Json, Run, RunOptions};
+use auto_e2h::learn::{
+    Accepted, Collected, Json, Lesson, Method, Parts, Result, Round, Run, RunOptions, Tools,
+};
 use auto_e2h::refine::Fate;
 use auto_e2h::report::folder::sealed;
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 fn options(out: &Path) -> RunOptions {
     RunOptions {
@@ -221,4 +224,36 @@ fn minutes_of_a_stage_are_those_of_all_processes_that_worked_on_it() {
     let minutes = run.evaluate(0, &*hard, None).unwrap().stage_minutes["train"];
     assert!((1000.0..1001.0).contains(&minutes), "{minutes}");
     assert!(!spent.exists(), "left over");
+}
+
+/// Learns nothing from a round.
+struct Idle;
+
+impl Method for Idle {
+    fn name(&self) -> &str {
+        "idle"
+    }
+
+    fn lesson(&self, _: &Round<'_>, _: &Tools<'_>) -> Result<Lesson> {
+        Ok(Lesson::default())
+    }
+}
+
+#[test]
+fn a_method_of_ones_own_is_told_from_the_usual_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut options = options(&dir.path().join("run"));
+    options.set.push("train.initial_steps=2".to_owned());
+    let parts = Parts { method: Some(Arc::new(Idle)), ..Parts::default() };
+    let run = Run::open_with(&options, &parts).unwrap();
+    let base = run.demonstrations().unwrap();
+    let hard = run.train_initial(&base).unwrap();
+    let accepted = run.lesson(1, &base, &*hard, || Ok(scripted(&run))).unwrap();
+    assert!(accepted.segments.is_empty() && accepted.collection.hard_successes == 3);
+    drop(run);
+
+    options.resume = true;
+    let message = Run::open(&options).err().unwrap().to_string();
+    assert!(message.contains("found nut_assembly smoke idle diffusion seed 5"), "{message}");
+    Run::open_with(&options, &parts).unwrap();
 }

@@ -1,7 +1,6 @@
 //! The run directory: what is in it, and how it is written so that a kill at any instant leaves it usable.
 
 use crate::config::{Resolved, RunConfig};
-use crate::run::RunOptions;
 use crate::{Error, Result};
 use e2h_core::Episode;
 use e2h_data::lerobot::{Dataset, Writer, features_of};
@@ -121,18 +120,11 @@ impl Directory {
     /// Makes a new run directory, or goes on with one of the same run.
     pub(crate) fn open(
         path: &Path,
-        options: &RunOptions,
+        resume: bool,
+        identity: &Identity,
         resolved: &Resolved,
         task: &dyn Task,
     ) -> Result<Self> {
-        let resume = options.resume;
-        let identity = Identity {
-            format: LAYOUT,
-            task: options.task.clone(),
-            preset: resolved.preset.clone(),
-            seed: options.seed,
-            method: options.method.clone(),
-        };
         let file = path.join(IDENTITY_FILE);
         if resume && !path.exists() {
             return Err(Error::Nothing(path.to_owned()));
@@ -154,7 +146,7 @@ impl Directory {
         sweep(path, DEEPEST)?;
         if !file.exists() {
             write_atomic(&path.join("config.toml"), resolved.text.as_bytes())?;
-            this.put(IDENTITY_FILE, &identity)?;
+            this.put(IDENTITY_FILE, identity)?;
             return Ok(this);
         }
         // Made by another process since it was looked for.
@@ -168,9 +160,10 @@ impl Directory {
         if found.format != LAYOUT {
             return differs("layout version", LAYOUT.to_string(), found.format.to_string());
         }
-        if found != identity {
-            let text = |i: &Identity| format!("{} {} {} seed {}", i.task, i.preset, i.method, i.seed);
-            return differs("run.json", text(&identity), text(&found));
+        if found != *identity {
+            let text =
+                |i: &Identity| format!("{} {} {} {} seed {}", i.task, i.preset, i.method, i.policy, i.seed);
+            return differs("run.json", text(identity), text(&found));
         }
         let config = path.join("config.toml");
         let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;

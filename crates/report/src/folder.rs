@@ -32,6 +32,13 @@ pub struct Identity {
     /// Method name; none in runs of version 0.1, which were all of `auto-e2h`.
     #[serde(default = "auto_e2h")]
     pub method: String,
+    /// Class of its policies; none in runs of version 0.1, which were all `diffusion`.
+    #[serde(default = "diffusion")]
+    pub policy: String,
+}
+
+fn diffusion() -> String {
+    "diffusion".to_owned()
 }
 
 fn auto_e2h() -> String {
@@ -163,6 +170,7 @@ mod tests {
             preset: "smoke".to_owned(),
             seed: 7,
             method: auto_e2h(),
+            policy: diffusion(),
         };
         let text = format!("{}\n", sealed(&serde_json::to_string_pretty(&identity).unwrap()));
         std::fs::write(&path, &text).unwrap();

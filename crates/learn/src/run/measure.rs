@@ -117,7 +117,7 @@ impl Run {
             task: self.options.task.clone(),
             variant: c.task.variant.clone(),
             preset: self.options.preset.clone(),
-            method: self.options.method.clone(),
+            method: self.identity.method.clone(),
             seed: self.options.seed,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             demonstrations: c.closed_loop.demonstrations,

@@ -55,8 +55,8 @@ fn features(state: &core::State, normaliser: &Normaliser) -> [f32; FEATURES] {
     row
 }
 
-fn tensor(rows: Vec<f32>, width: usize) -> candle_core::Result<Tensor> {
-    Tensor::from_vec(rows.clone(), (rows.len() / width, width), &Device::Cpu)
+fn tensor(rows: &[f32], width: usize) -> candle_core::Result<Tensor> {
+    Tensor::from_slice(rows, (rows.len() / width, width), &Device::Cpu)
 }
 
 struct Cloned {
@@ -79,8 +79,8 @@ impl Policy for Cloned {
     }
 
     fn act(&self, histories: &[Vec<&Observation>], _: &mut [Rng]) -> core::Result<Vec<ActionChunk>> {
-        let rows = histories.iter().flat_map(|h| features(&h[0].state, &self.normaliser)).collect();
-        let output = tensor(rows, FEATURES).and_then(|x| self.net.forward(&x)?.to_vec2::<f32>());
+        let rows: Vec<f32> = histories.iter().flat_map(|h| features(&h[0].state, &self.normaliser)).collect();
+        let output = tensor(&rows, FEATURES).and_then(|x| self.net.forward(&x)?.to_vec2::<f32>());
         let output = output.map_err(|e| core::Error::Model(e.to_string()))?;
         let chunk = |row: &Vec<f32>| {
             row.as_chunks::<ACTION_DIM>().0.iter().map(|a| self.normaliser.unnormalise_action(a)).collect()
@@ -133,21 +133,15 @@ impl Training for Cloning<'_> {
                 .unwrap_or(&there[0]);
             let episode = &source.episodes[rng.random_range(0..source.episodes.len())];
             let t = rng.random_range(0..episode.len());
-            x.extend(features(&episode.state[t], &self.job.normaliser.clone()));
+            x.extend(features(&episode.state[t], self.job.normaliser));
             for k in 0..CHUNK {
                 let row = (t + k).min(episode.len() - 1);
                 y.extend(self.job.normaliser.normalise_action(&episode.action[row]));
             }
         }
-        let loss = mse(
-            &self
-                .policy
-                .net
-                .forward(&tensor(x, FEATURES).map_err(nn::Error::from)?)
-                .map_err(nn::Error::from)?,
-            &tensor(y, CHUNK * ACTION_DIM).map_err(nn::Error::from)?,
-            None,
-        )?;
+        let net = &self.policy.net;
+        let learn = || mse(&net.forward(&tensor(&x, FEATURES)?)?, &tensor(&y, CHUNK * ACTION_DIM)?, None);
+        let loss: Tensor = learn()?;
         let value = loss.to_scalar::<f32>().map_err(nn::Error::from)?;
         self.adam.step(&self.policy.params, &backward(&loss, &self.policy.params)?, 1e-3)?;
         self.step += 1;
@@ -163,14 +157,19 @@ impl Training for Cloning<'_> {
     fn save(&self, file: &Path) -> Result<()> {
         let mut all = self.policy.params.export()?;
         all.extend(self.adam.state()?.into_iter().map(|(name, t)| (format!("adam/{name}"), t)));
-        let step = vec![self.step as f32];
-        all.insert("step".to_owned(), nn::HostTensor { shape: vec![1], data: step });
+        for (name, data) in
+            [("step", vec![self.step as f32]), ("losses", self.losses.iter().copied().collect())]
+        {
+            all.insert(name.to_owned(), nn::HostTensor { shape: vec![data.len()], data });
+        }
         Ok(nn::save_weights(file, &all, &BTreeMap::new())?)
     }
 
     fn restore(&mut self, file: &Path) -> Result<()> {
         let (mut all, _) = nn::load_weights(file)?;
-        self.step = all.remove("step").map_or(0, |t| t.data[0] as usize);
+        let mut numbers = |name: &str| all.remove(name).map(|t| t.data).unwrap_or_default();
+        self.step = numbers("step").first().map_or(0, |&step| step as usize);
+        self.losses = numbers("losses").into();
         let (adam, net): (Weights, Weights) =
             all.into_iter().partition(|(name, _)| name.starts_with("adam/"));
         let adam = adam.into_iter().map(|(name, t)| (name.replacen("adam/", "", 1), t)).collect();

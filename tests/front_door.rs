@@ -28,6 +28,7 @@ fn it_lists_everything_there_is() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut names: Vec<String> = auto_e2h::env::registry().iter().map(|n| (*n).to_owned()).collect();
     names.extend(["smoke", "laptop", "paper"].map(str::to_owned));
+    names.extend(auto_e2h::learn::methods::registry().iter().map(|m| m.name.to_owned()));
     names.extend(examples().into_iter().map(|e| e.0));
     let checkpoints = std::fs::read_dir(root.join("checkpoints")).unwrap().flatten();
     let checkpoints = checkpoints.filter(|c| c.path().join("policy.json").exists());

@@ -3,6 +3,7 @@
 
 use auto_e2h::core::{Failure, say};
 use auto_e2h::env::{registry, variants};
+use auto_e2h::learn::methods;
 use auto_e2h::report::record::{RunResults, parse_results};
 use std::path::{Path, PathBuf};
 
@@ -39,6 +40,12 @@ pub(super) fn list() -> Result<()> {
         row(&stem(&path), &comment(&read(&path)?, "# "))?;
     }
     say("\n  --preset NAME; every value in configs/presets can be set with --set key=value\n")?;
+
+    say("Methods\n")?;
+    for method in methods::registry() {
+        row(method.name, method.about().trim_end_matches('.'))?;
+    }
+    say("\n  --method NAME; values of configs/methods are laid over preset and task\n")?;
 
     say(
         "Trained policies, and how they did when they were trained (checkpoints/NAME/README.md has the rest)\n",

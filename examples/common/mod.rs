@@ -47,7 +47,7 @@ struct Arguments {
     /// Sizes and step counts to run with.
     #[arg(long, value_enum, default_value = "laptop")]
     preset: Preset,
-    /// What the loop teaches: auto-e2h, auto-e2h-literal, no-kinematic, no-critic, direct-h or hard-demos.
+    /// What the loop teaches, by its name in configs/methods.
     #[arg(long, default_value = "auto-e2h")]
     method: String,
     /// Seed of everything random.

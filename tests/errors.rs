@@ -219,3 +219,59 @@ fn a_full_disk_leaves_nothing_half_written() {
     assert_success(&nut_assembly(&full, &["--resume"]).output().unwrap());
     assert_same_results(&whole, &full);
 }
+
+/// Pipes wait for ever and devices never end: neither is read, whichever file of a policy or a run it stands for.
+#[cfg(unix)]
+#[test]
+fn pipes_and_devices_in_place_of_files_are_refused() {
+    use std::process::Stdio;
+    let dir = tempfile::tempdir().unwrap();
+    let published = Path::new(env!("CARGO_MANIFEST_DIR")).join("checkpoints/nut_assembly");
+    let (policy, run) = (dir.path().join("policy"), dir.path().join("run"));
+    std::fs::create_dir(&policy).unwrap();
+    for file in ["policy.json", "model.safetensors"] {
+        std::fs::copy(published.join(file), policy.join(file)).unwrap();
+    }
+    std::fs::create_dir_all(&run).unwrap();
+    std::fs::write(run.join("run.json"), r#"{"format":2,"task":"nut_assembly","preset":"smoke","seed":0}"#)
+        .unwrap();
+    std::fs::write(run.join("config.toml"), "").unwrap();
+    let evaluate = || {
+        let mut command = example("evaluate");
+        command.args(["--trials", "1", "--checkpoint"]).arg(&policy);
+        command
+    };
+    let view = || {
+        let mut command = example("view");
+        command.arg(&run);
+        command
+    };
+    for (folder, file, command) in [
+        (&policy, "policy.json", &evaluate as &dyn Fn() -> Command),
+        (&policy, "model.safetensors", &evaluate),
+        (&run, "run.json", &view),
+        (&run, "config.toml", &view),
+    ] {
+        let (place, kept) = (folder.join(file), dir.path().join("kept"));
+        std::fs::rename(&place, &kept).unwrap();
+        for pipe in [true, false] {
+            if pipe {
+                assert!(Command::new("mkfifo").arg(&place).status().unwrap().success());
+            } else {
+                std::os::unix::fs::symlink("/dev/zero", &place).unwrap();
+            }
+            let mut child = command().stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+            let begun = std::time::Instant::now();
+            while child.try_wait().unwrap().is_none() && begun.elapsed().as_secs() < 30 {
+                std::thread::sleep(std::time::Duration::from_millis(10));
+            }
+            child.kill().unwrap();
+            let output = child.wait_with_output().unwrap();
+            let words = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(1), "{file}, a pipe: {pipe}: {words}");
+            assert!(words.contains(file) && words.contains("expected a regular file"), "{words}");
+            std::fs::remove_file(&place).unwrap();
+        }
+        std::fs::rename(&kept, &place).unwrap();
+    }
+}

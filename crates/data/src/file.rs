@@ -63,6 +63,35 @@ pub fn read_regular(path: &Path, limit: u64) -> Result<Vec<u8>> {
     if bytes.len() as u64 > limit { Err(large(bytes.len() as u64)) } else { Ok(bytes) }
 }
 
+/// Most bytes of a description or a record that is text, 1 GiB.
+pub const MOST_TEXT: u64 = 1 << 30;
+/// Most bytes of a file of weights, 64 GiB.
+pub const MOST_WEIGHTS: u64 = 64 << 30;
+
+/// As [`read_regular`], for those who tell errors of the system in words of their own.
+///
+/// # Errors
+/// Those of the system; `InvalidInput` for what is no regular file or too large.
+pub fn read_file(path: &Path, limit: u64) -> std::io::Result<Vec<u8>> {
+    read_regular(path, limit).map_err(|e| match e {
+        Error::Io { source, .. } => source,
+        Error::Unsupported { expected, found, .. } => std::io::Error::new(
+            std::io::ErrorKind::InvalidInput,
+            format!("expected {expected}, found {found}"),
+        ),
+        other => std::io::Error::other(other),
+    })
+}
+
+/// The same, as text.
+///
+/// # Errors
+/// As [`read_file`], and `InvalidData` for what is no UTF-8.
+pub fn read_text(path: &Path) -> std::io::Result<String> {
+    let text = String::from_utf8(read_file(path, MOST_TEXT)?);
+    text.map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidData, e.utf8_error()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -42,7 +42,7 @@ mod window;
 
 pub use atomic::write as write_atomic;
 pub use error::{Error, Result};
-pub use file::read_regular;
+pub use file::{MOST_TEXT, MOST_WEIGHTS, read_file, read_regular, read_text};
 pub use normalise::{Normaliser, NormaliserConfig};
 pub use resize::resize_image;
 pub use sample::{Pick, Sampler, Source};

@@ -166,7 +166,7 @@ impl Directory {
             return differs("run.json", text(identity), text(&found));
         }
         let config = path.join("config.toml");
-        let text = std::fs::read_to_string(&config).map_err(io("reading", &config))?;
+        let text = e2h_data::read_text(&config).map_err(io("reading", &config))?;
         // What later versions added has a default, which is what was done before. Where a key has none, or is gone, no value of
         // ours is what the run was begun with.
         let difference = difference(&text, resolved, task).map_err(|e| Error::Foreign {
@@ -199,7 +199,7 @@ impl Directory {
     /// SHA-256 of a file, to verify it with when it is read again.
     pub(crate) fn sha256(&self, name: &str) -> Result<String> {
         let path = self.join(name);
-        Ok(sha256(&std::fs::read(&path).map_err(io("reading", &path))?))
+        Ok(sha256(&e2h_data::read_file(&path, e2h_data::MOST_WEIGHTS).map_err(io("reading", &path))?))
     }
 
     /// Refuses a file that is not the one that was written; without a checksum any is taken.

@@ -88,11 +88,13 @@ pub fn load_weights_without(
     skip: impl Fn(&str) -> bool,
 ) -> Result<(Weights, BTreeMap<String, String>)> {
     let path = path.as_ref();
-    let bytes = std::fs::read(path).map_err(|source| Error::Io {
-        doing: "reading",
-        path: path.to_path_buf(),
-        source,
-    })?;
+    let io = |source| Error::Io { doing: "reading", path: path.to_path_buf(), source };
+    // Pipes wait for ever, and devices never end.
+    if !std::fs::metadata(path).map_err(io)?.is_file() {
+        let problem = "expected a regular file, found a folder, a pipe or a device";
+        return Err(io(std::io::Error::new(std::io::ErrorKind::InvalidInput, problem)));
+    }
+    let bytes = std::fs::read(path).map_err(io)?;
     parse_weights(&bytes, path, skip)
 }
 

@@ -46,7 +46,7 @@ pub(crate) fn read_description(
     kind: Option<&str>,
     numbers: &[(&str, u64)],
 ) -> Result<serde_json::Value> {
-    let bytes = std::fs::read(path).map_err(io("reading checkpoint", path))?;
+    let bytes = e2h_data::read_file(path, e2h_data::MOST_TEXT).map_err(io("reading checkpoint", path))?;
     let fail = |problem: String| Error::Checkpoint { path: path.to_owned(), problem };
     let value: serde_json::Value =
         serde_json::from_slice(&bytes).map_err(|e| fail(format!("expected JSON, found {e}")))?;
@@ -69,7 +69,8 @@ pub(crate) fn read_description(
 /// Reads the weights of `dir`, if they are those with this SHA-256: the bytes that were verified are the ones that are parsed.
 pub(crate) fn read_verified(dir: &Path, sha256: &str) -> Result<Weights> {
     let path = dir.join(WEIGHTS_FILE);
-    let bytes = std::fs::read(&path).map_err(io("reading checkpoint", &path))?;
+    let bytes =
+        e2h_data::read_file(&path, e2h_data::MOST_WEIGHTS).map_err(io("reading checkpoint", &path))?;
     let found = hex(&bytes);
     if found != sha256 {
         let problem = format!("expected SHA-256 {sha256}, found {found}");

@@ -128,7 +128,7 @@ pub fn sealed(text: &str) -> String {
 /// # Errors
 /// When it cannot be read, its seal is broken, or it is not what a run writes.
 pub fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
-    let text = match std::fs::read_to_string(path) {
+    let text = match e2h_data::read_text(path) {
         Ok(text) => text,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(e) => return Err(io("reading", path)(e)),

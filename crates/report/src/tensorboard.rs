@@ -122,7 +122,7 @@ fn signed(step: u64) -> i64 {
 /// # Errors
 /// When the file cannot be read, a checksum is wrong, or a record is no event.
 pub fn read(path: &Path) -> Result<Vec<Event>> {
-    let bytes = std::fs::read(path).map_err(io("reading", path))?;
+    let bytes = e2h_data::read_file(path, e2h_data::MOST_WEIGHTS).map_err(io("reading", path))?;
     let bad = |at: usize, expected: &str, found: String| Error::Foreign {
         path: path.to_owned(),
         quantity: format!("record at byte {at}"),

@@ -25,7 +25,7 @@ pub(super) fn files(publication: &Publication) -> Result<Files> {
     let own = measured.as_ref().and_then(|(runs, _)| runs.iter().find(made));
     let read = |name| {
         let path = dir.join(name);
-        Ok((name, std::fs::read(&path).map_err(io("reading", &path))?))
+        Ok((name, e2h_data::read_file(&path, e2h_data::MOST_WEIGHTS).map_err(io("reading", &path))?))
     };
     let mut files: Files =
         ["policy.json", "model.safetensors"].into_iter().map(read).collect::<Result<_>>()?;

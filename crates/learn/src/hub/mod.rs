@@ -180,7 +180,7 @@ pub fn publish(publication: &Publication, settings: &Settings) -> Result<String>
 type Files = Vec<(&'static str, Vec<u8>)>;
 
 fn read_if_there(path: &Path) -> Result<Option<String>> {
-    match std::fs::read_to_string(path) {
+    match e2h_data::read_text(path) {
         Ok(text) => Ok(Some(text)),
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(e) => Err(crate::directory::io("reading", path)(e)),

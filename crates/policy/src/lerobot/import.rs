@@ -23,7 +23,7 @@ use std::path::Path;
 /// to become one of today.
 pub fn import(dir: &Path) -> Result<LerobotPolicy> {
     let path = dir.join(CONFIG_FILE);
-    let bytes = std::fs::read(&path).map_err(|source| Error::Io {
+    let bytes = e2h_data::read_file(&path, e2h_data::MOST_TEXT).map_err(|source| Error::Io {
         doing: "reading LeRobot checkpoint",
         path: path.clone(),
         source,

@@ -115,7 +115,7 @@ impl Statistics {
     /// Reads pipeline `name` of a folder. Steps that would change numbers otherwise are added to `obstacles`.
     pub(super) fn read(dir: &Path, name: &str, obstacles: &mut Vec<Obstacle>) -> Result<Self> {
         let path = dir.join(format!("{name}.json"));
-        let bytes = std::fs::read(&path).map_err(|source| Error::Io {
+        let bytes = e2h_data::read_file(&path, e2h_data::MOST_TEXT).map_err(|source| Error::Io {
             doing: "reading LeRobot checkpoint",
             path: path.clone(),
             source,

@@ -77,7 +77,7 @@ impl RunSource {
     pub(super) fn open(path: &Path) -> Result<Self> {
         let dir = RunFolder::open(path)?;
         let file = path.join("config.toml");
-        let text = std::fs::read_to_string(&file).map_err(io("reading", &file))?;
+        let text = e2h_data::read_text(&file).map_err(io("reading", &file))?;
         let config = Settings::read(&text);
         let mut this = Self {
             listed: vec![],

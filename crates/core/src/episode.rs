@@ -1,7 +1,7 @@
 use crate::state::{EEF, OPENING};
-use crate::{ACTION_DIM, Error, Pose, Result, STATE_DIM};
+use crate::{ACTION_DIM, Error, ImageStore, Pixels, Pose, Result, STATE_DIM};
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
+use std::borrow::Cow;
 
 /// One state row. Units: metres, unit quaternions (wxyz), metres of gripper opening.
 pub type State = [f32; STATE_DIM];
@@ -144,11 +144,11 @@ pub struct Observation {
 /// The images of one camera over an episode, one per row.
 ///
 /// An image is shared by all episodes that show it: cloning an episode or selecting rows of it copies no pixel, and an image
-/// is freed with the last episode that shows it.
+/// is freed with the last episode that shows it. Where it lies, in memory or on the disk, is its own affair ([`Pixels`]).
 ///
 /// # Shapes
 /// `images` (T), each (height, width, 3), row-major, 8 bits per channel.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Frames {
     /// Camera name.
     pub camera: String,
@@ -157,7 +157,7 @@ pub struct Frames {
     /// Columns.
     pub width: usize,
     /// RGB bytes of each row's image.
-    pub images: Vec<Arc<[u8]>>,
+    pub images: Vec<Pixels>,
 }
 
 impl Frames {
@@ -168,23 +168,31 @@ impl Frames {
     /// `bytes` is (T, height, width, 3).
     #[must_use]
     pub fn new(camera: &str, height: usize, width: usize, bytes: &[u8]) -> Self {
-        let images = bytes.chunks((height * width * 3).max(1)).map(Arc::from).collect();
+        let images = bytes.chunks((height * width * 3).max(1)).map(Pixels::from).collect();
         Self { camera: camera.to_owned(), height, width, images }
     }
 
     /// Bytes of image `row`; empty when there is no such row.
-    #[must_use]
-    pub fn image(&self, row: usize) -> &[u8] {
-        self.images.get(row).map_or(&[], |image| image)
+    ///
+    /// # Errors
+    /// When the image lies on the disk and cannot be read.
+    pub fn image(&self, row: usize) -> Result<Cow<'_, [u8]>> {
+        self.images.get(row).map_or(Ok(Cow::Borrowed(&[])), Pixels::read)
     }
 
     /// A copy of all images, one after the other: what [`Frames::new`] takes.
     ///
     /// # Shapes
     /// The result is (T, height, width, 3).
-    #[must_use]
-    pub fn to_bytes(&self) -> Vec<u8> {
-        self.images.concat()
+    ///
+    /// # Errors
+    /// When an image lies on the disk and cannot be read.
+    pub fn to_bytes(&self) -> Result<Vec<u8>> {
+        let mut all = vec![];
+        for image in &self.images {
+            all.extend_from_slice(&image.read()?);
+        }
+        Ok(all)
     }
 }
 
@@ -297,6 +305,17 @@ impl Episode {
         }
     }
 
+    /// Moves the images to `store`: from here on they take no memory, and reading them takes a moment.
+    ///
+    /// # Errors
+    /// When an image cannot be read or written; those before it have moved, and all are there.
+    pub fn store_images(&mut self, store: &ImageStore) -> Result<()> {
+        for image in self.frames.iter_mut().flat_map(|f| &mut f.images) {
+            *image = image.stored(store)?;
+        }
+        Ok(())
+    }
+
     /// Pose of the tool centre point in row `t`.
     #[must_use]
     pub fn eef(&self, t: usize) -> Pose {
@@ -328,7 +347,7 @@ impl Episode {
             rows(&f.camera, f.images.len())?;
             let expected = f.height * f.width * 3;
             if let Some(row) = f.images.iter().position(|image| image.len() != expected) {
-                let (camera, found) = (f.camera.clone(), f.image(row).len());
+                let (camera, found) = (f.camera.clone(), f.images[row].len());
                 return Err(Error::ImageBytes { camera, row, expected, found });
             }
         }
@@ -366,7 +385,7 @@ mod tests {
         let e = episode(5);
         let s = e.select(&[4, 1, 9]);
         assert_eq!(s.source, [4, 1]);
-        assert_eq!(s.frames[0].image(1), &[1; 12]);
+        assert_eq!(*s.frames[0].image(1).unwrap(), [1; 12]);
         assert!(!s.terminal);
         assert!(e.select(&[0, 4]).terminal);
         s.validate().unwrap();
@@ -376,16 +395,28 @@ mod tests {
     fn images_are_shared_and_outlive_the_episode_that_they_came_with() {
         let e = episode(5);
         let s = e.select(&[3, 0]).select(&[1]);
-        assert!(Arc::ptr_eq(&s.frames[0].images[0], &e.frames[0].images[0]));
+        let first = |e: &Episode| e.frames[0].image(0).unwrap().as_ptr();
+        assert_eq!(first(&s), first(&e));
         drop(e);
-        assert_eq!(Arc::strong_count(&s.frames[0].images[0]), 1);
-        assert_eq!(s.frames[0].image(0), &[0; 12]);
+        assert_eq!(*s.frames[0].image(0).unwrap(), [0; 12]);
+    }
+
+    #[test]
+    fn an_episode_is_the_same_with_its_images_on_the_disk() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = ImageStore::create(folder.path()).unwrap();
+        let (mut e, whole) = (episode(5), episode(5));
+        e.store_images(&store).unwrap();
+        assert!(e.frames[0].images.iter().all(|image| !image.in_memory()));
+        assert_eq!(e, whole);
+        assert_eq!(e.select(&[4, 2]), whole.select(&[4, 2]));
+        assert_eq!(store.bytes(), 5 * 12);
     }
 
     #[test]
     fn images_of_another_size_are_refused_by_row() {
         let mut e = episode(3);
-        let bytes = e.frames[0].to_bytes();
+        let bytes = e.frames[0].to_bytes().unwrap();
         assert_eq!(Frames::new("table", 2, 2, &bytes), e.frames[0]);
         e.frames[0] = Frames::new("table", 2, 2, &bytes[..35]);
         let message = e.validate().unwrap_err().to_string();

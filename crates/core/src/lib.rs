@@ -15,6 +15,7 @@
 
 mod episode;
 mod failure;
+mod pixels;
 mod pose;
 mod random;
 mod say;
@@ -26,6 +27,7 @@ pub use episode::{
     Action, Direction, Episode, Excursion, Frames, Image, Kind, Observation, Origin, Outcome, State,
 };
 pub use failure::Failure;
+pub use pixels::{ImageStore, Pixels};
 pub use pose::{Pose, align_hemisphere, continue_signs};
 pub use random::{Rng, fnv1a, stream};
 pub use say::{mention, say};
@@ -50,6 +52,16 @@ pub enum Error {
         expected: usize,
         /// Images in the observation.
         found: usize,
+    },
+    /// Images that are kept on the disk cannot be written or read.
+    #[error("images that are kept on the disk of {}: {doing} failed: {source}", folder.display())]
+    Store {
+        /// What was tried.
+        doing: &'static str,
+        /// Folder on whose disk they lie.
+        folder: std::path::PathBuf,
+        /// Why it failed.
+        source: std::io::Error,
     },
     /// An image differs in size from those before it.
     #[error("camera `{camera}`: expected {expected:?} (height, width), got {found:?}")]

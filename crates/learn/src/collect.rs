@@ -5,7 +5,7 @@ use crate::explore::Wander;
 use crate::record::{Automatic, ResetCause};
 use crate::rollout::{self, Finished, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
-use e2h_core::{Direction, Episode, Kind, Origin, Outcome, Policy, stream};
+use e2h_core::{Direction, Episode, ImageStore, Kind, Origin, Outcome, Policy, stream};
 use e2h_env::Env;
 use std::collections::{BTreeMap, VecDeque};
 
@@ -45,16 +45,18 @@ struct Loop {
     collected: Collected,
 }
 
-/// Runs `config.cycles` cycles, spread over `envs` (one loop each).
+/// Runs `config.cycles` cycles, spread over `envs` (one loop each). Images of rollouts that have ended go to `images`, where there
+/// is one: in memory they are megabytes a rollout.
 ///
 /// # Errors
-/// When the observations do not fit the policies or the simulation fails.
+/// When the observations do not fit the policies, the simulation fails or images cannot be written.
 pub fn collect(
     envs: Vec<Env>,
     hard: &dyn Policy,
     easy: &dyn Policy,
     config: &LoopConfig,
     origin: &Origin,
+    images: Option<&ImageStore>,
     progress: &Progress,
 ) -> Result<Collected> {
     let n = envs.len();
@@ -111,7 +113,10 @@ pub fn collect(
         }
     };
     let next = |lane: &mut Lane<Loop>, finished: Finished, direction: Direction| -> Result<()> {
-        let Some(episode) = finished.episode else { return Ok(()) };
+        let Some(mut episode) = finished.episode else { return Ok(()) };
+        if let Some(store) = images {
+            episode.store_images(store)?;
+        }
         let success = finished.outcome.is_success();
         // What only an external reset repairs.
         let accident = match finished.outcome {

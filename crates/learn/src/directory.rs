@@ -2,7 +2,7 @@
 
 use crate::config::{Resolved, RunConfig};
 use crate::{Error, Result};
-use e2h_core::Episode;
+use e2h_core::{Episode, ImageStore};
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use e2h_env::Task;
 use e2h_report::folder::{IDENTITY_FILE, Identity, LAYOUT, SUMS_FILE, compare, read_json, sealed, sha256};
@@ -32,6 +32,8 @@ const DEEPEST: usize = 5;
 #[derive(Debug, Clone)]
 pub(crate) struct Directory {
     path: PathBuf,
+    /// Images of all episodes that the run keeps: rounds of them are gigabytes, and training wants a few of them at a time.
+    images: ImageStore,
     /// Held as long as this process works in it; none for one that only reads, and on file systems that have no locks.
     _lock: Option<Arc<File>>,
 }
@@ -142,7 +144,8 @@ impl Directory {
             return Err(Error::Exists(path.to_owned()));
         }
         std::fs::create_dir_all(path).map_err(io("creating", path))?;
-        let this = Self { path: path.to_owned(), _lock: lock(path)? };
+        let lock = lock(path)?;
+        let this = Self { path: path.to_owned(), images: ImageStore::create(path)?, _lock: lock };
         sweep(path, DEEPEST)?;
         if !file.exists() {
             write_atomic(&path.join("config.toml"), resolved.text.as_bytes())?;
@@ -190,6 +193,11 @@ impl Directory {
 
     pub(crate) fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Where images of episodes go that the run keeps.
+    pub(crate) fn images(&self) -> &ImageStore {
+        &self.images
     }
 
     pub(crate) fn join(&self, name: impl AsRef<Path>) -> PathBuf {
@@ -318,8 +326,11 @@ impl Directory {
             return Ok(Some((vec![], notes)));
         }
         let dataset = Dataset::open(root)?;
-        let episodes =
-            (0..dataset.len()).map(|i| dataset.read_episode(i)).collect::<std::result::Result<_, _>>()?;
-        Ok(Some((episodes, notes)))
+        let read = |i| -> Result<Episode> {
+            let mut episode = dataset.read_episode(i)?;
+            episode.store_images(&self.images)?;
+            Ok(episode)
+        };
+        Ok(Some(((0..dataset.len()).map(read).collect::<Result<_>>()?, notes)))
     }
 }

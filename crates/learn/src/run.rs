@@ -245,7 +245,8 @@ impl Run {
                     recorded => Some(recorded?).filter(|e| e.outcome.is_success()),
                 };
                 index += 1;
-                if let Some(episode) = episode {
+                if let Some(mut episode) = episode {
+                    episode.store_images(self.dir.images())?;
                     episodes.push(episode);
                 } else {
                     failed += 1;

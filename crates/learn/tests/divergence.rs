@@ -105,7 +105,7 @@ fn collected(env: Env) -> Result<Collected> {
     let mut config = RunConfig::resolve("smoke", "cube_pick_place", &[]).unwrap().config.closed_loop;
     (config.cycles, config.homing, config.after_failure) = (3, true, AfterFailure::Continue);
     let origin = Origin::demonstration("cube_pick_place", Direction::Easy, 0, 3);
-    collect(vec![env], &Still, &Still, &config, &origin, &Progress::new(true))
+    collect(vec![env], &Still, &Still, &config, &origin, None, &Progress::new(true))
 }
 
 fn resets(collected: &Collected) -> Vec<(ResetCause, usize)> {

@@ -79,7 +79,7 @@ fn collected_by(easy: &Carry, iteration: u32, explore: ExploreConfig, threads: u
         ..Origin::demonstration("cube_pick_place", Direction::Easy, 0, 7)
     };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-    pool.install(|| collect(envs, &Still, easy, &config, &origin, &Progress::new(true))).unwrap()
+    pool.install(|| collect(envs, &Still, easy, &config, &origin, None, &Progress::new(true))).unwrap()
 }
 
 #[test]

@@ -409,7 +409,7 @@ fn act(run: &Run, policy: &dyn Trained, base: &Demonstrations) -> u64 {
     let episode = &base.easy[0];
     let image = |name: &String| {
         let frames = episode.frames.iter().find(|f| f.camera == *name).unwrap();
-        Image { height: frames.height, width: frames.width, data: frames.image(0).to_vec() }
+        Image { height: frames.height, width: frames.width, data: frames.image(0).unwrap().into_owned() }
     };
     let observation = Observation { state: episode.state[0], frames: c.cameras.iter().map(image).collect() };
     let history = vec![&observation; c.n_obs_steps];

@@ -134,7 +134,7 @@ impl Critic {
                 ))
             })?;
             for &row in &rows[c.n_obs_steps - c.n_image_steps..] {
-                host.push_image(camera, frames.image(row), corner, c.crop_size, jitter);
+                host.push_image(camera, &frames.image(row)?, corner, c.crop_size, jitter);
             }
         }
         Ok(())

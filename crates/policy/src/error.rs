@@ -107,6 +107,9 @@ pub enum Error {
     /// Windows or normaliser failed.
     #[error(transparent)]
     Dataset(#[from] e2h_data::Error),
+    /// Images of an episode could not be read.
+    #[error(transparent)]
+    Images(#[from] e2h_core::Error),
 }
 
 fn list(obstacles: &[Obstacle]) -> String {

@@ -253,7 +253,7 @@ impl Trainer {
                         ))
                     })?;
                     for &row in &window.observations[first_image..] {
-                        host.push_image(camera, frames.image(row), corner, c.crop_size, None);
+                        host.push_image(camera, &frames.image(row)?, corner, c.crop_size, None);
                     }
                 }
             }

@@ -69,7 +69,7 @@ fn one_trajectory_is_overfitted_and_the_sampled_actions_are_its_own() {
             frames: e
                 .frames
                 .iter()
-                .map(|f| Image { height: 24, width: 24, data: f.image(t).to_vec() })
+                .map(|f| Image { height: 24, width: 24, data: f.image(t).unwrap().into_owned() })
                 .collect(),
         })
         .to_vec();

@@ -59,7 +59,7 @@ mod tests {
         // 3 mm per frame at 30 Hz are 4.5 mm at 20 Hz.
         let at_20 = resample(&along(&walk(&[(6, 0.003)])), 30.0, 20.0, &DOWN).unwrap();
         assert_eq!(at_20.source, [0, 2, 3, 5, 6]);
-        assert_eq!(at_20.frames[0].image(1), &[2; 3]);
+        assert_eq!(*at_20.frames[0].image(1).unwrap(), [2; 3]);
         for (t, state) in at_20.state.iter().enumerate() {
             assert!((state[0] - 0.0045 * t as f32).abs() < 1e-6, "{t}: {}", state[0]);
         }

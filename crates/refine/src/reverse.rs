@@ -175,7 +175,7 @@ mod tests {
         let hard = reverse(&easy, &reversal());
         assert_eq!(hard.source, [4, 3, 2, 1, 0]);
         assert_eq!(hard.state[0], easy.state[4]);
-        assert_eq!(hard.frames[0].image(0), [4, 4, 4]);
+        assert_eq!(*hard.frames[0].image(0).unwrap(), [4, 4, 4]);
         assert!(hard.origin.reversed && hard.terminal);
         let again = reverse(&hard, &reversal());
         assert_eq!((&again.state, &again.frames, &again.source), (&easy.state, &easy.frames, &easy.source));

@@ -78,7 +78,7 @@ fn check_bookkeeping(input: &Episode, refined: &Refined) {
         segment.validate().unwrap();
         for (t, &source) in segment.source.iter().enumerate() {
             assert_eq!(
-                segment.frames[0].image(t)[0],
+                segment.frames[0].image(t).unwrap()[0],
                 (source % 251) as u8,
                 "an image is that of its source row"
             );

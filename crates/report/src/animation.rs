@@ -111,16 +111,20 @@ fn difference(before: Option<&Image>, frame: &Image, area: &Area) -> Vec<u8> {
 }
 
 /// Images of one camera of an episode, each `every`-th row and the last; empty when there is no such camera.
-#[must_use]
-pub fn episode_frames(episode: &Episode, camera: usize, every: usize) -> Vec<Image> {
+///
+/// # Errors
+/// When an image lies on the disk and cannot be read.
+pub fn episode_frames(episode: &Episode, camera: usize, every: usize) -> Result<Vec<Image>> {
     let last = episode.len().saturating_sub(1);
     let rows = (0..episode.len()).filter(|t| t % every.max(1) == 0 || *t == last);
     pick(episode, camera, rows)
 }
 
 /// `count` images of one camera, evenly spread over the episode from its first row to its last.
-#[must_use]
-pub fn sampled_frames(episode: &Episode, camera: usize, count: usize) -> Vec<Image> {
+///
+/// # Errors
+/// When an image lies on the disk and cannot be read.
+pub fn sampled_frames(episode: &Episode, camera: usize, count: usize) -> Result<Vec<Image>> {
     pick(episode, camera, (0..count).map(|i| sample_row(i, count, episode.len())))
 }
 
@@ -130,9 +134,9 @@ pub(crate) fn sample_row(i: usize, count: usize, rows: usize) -> usize {
     (i * rows.saturating_sub(1) + gaps / 2) / gaps
 }
 
-fn pick(episode: &Episode, camera: usize, rows: impl Iterator<Item = usize>) -> Vec<Image> {
-    let Some(f) = episode.frames.get(camera).filter(|_| !episode.is_empty()) else { return vec![] };
-    rows.map(|t| Image { height: f.height, width: f.width, data: f.image(t).to_vec() }).collect()
+fn pick(episode: &Episode, camera: usize, rows: impl Iterator<Item = usize>) -> Result<Vec<Image>> {
+    let Some(f) = episode.frames.get(camera).filter(|_| !episode.is_empty()) else { return Ok(vec![]) };
+    rows.map(|t| Ok(Image { height: f.height, width: f.width, data: f.image(t)?.into_owned() })).collect()
 }
 
 /// `image` with each pixel drawn `k` x `k` times; `k` = 0 counts as 1.
@@ -309,9 +313,9 @@ mod tests {
         assert_eq!(rows, [0, 3, 6, 9]);
         assert_eq!((sample_row(0, 1, 10), sample_row(7, 8, 1)), (0, 0));
         let e = sample::episode(7);
-        assert_eq!(episode_frames(&e, 0, 3).len(), 3);
-        assert_eq!(episode_frames(&e, 0, 4).len(), 3);
-        assert_eq!(sampled_frames(&e, 0, 5).len(), 5);
-        assert!(sampled_frames(&e, 9, 5).is_empty());
+        assert_eq!(episode_frames(&e, 0, 3).unwrap().len(), 3);
+        assert_eq!(episode_frames(&e, 0, 4).unwrap().len(), 3);
+        assert_eq!(sampled_frames(&e, 0, 5).unwrap().len(), 5);
+        assert!(sampled_frames(&e, 9, 5).unwrap().is_empty());
     }
 }

@@ -73,6 +73,9 @@ pub enum Error {
     /// Episodes on disk failed, or a file could not be written.
     #[error(transparent)]
     Data(#[from] e2h_data::Error),
+    /// Images of an episode could not be read.
+    #[error(transparent)]
+    Images(#[from] e2h_core::Error),
 }
 
 /// Shorthand for a result with this crate's [`enum@Error`].

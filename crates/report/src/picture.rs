@@ -23,7 +23,7 @@ pub fn filter(episode: &Episode, refined: &Refined, config: &KinematicConfig) ->
         static_speed: config.static_speed as f32,
         slow_speed: config.slow_speed as f32,
         fates: refined.fates.iter().map(|f| f.name().to_owned()).collect(),
-        frames: sampled_frames(episode, 0, 8),
+        frames: sampled_frames(episode, 0, 8)?,
     };
     picture.svg()
 }

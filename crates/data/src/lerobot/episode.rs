@@ -161,7 +161,7 @@ pub fn to_table(episode: &Episode, fates: &[i64]) -> Result<Table> {
     }
     let mut columns = vec![("observation.state".to_owned(), Column::F32(episode.state.concat()))];
     for frames in &episode.frames {
-        let png = |t| picture::encode(frames.height, frames.width, frames.image(t));
+        let png = |t| picture::encode(frames.height, frames.width, &frames.image(t).map_err(bad)?);
         let files = (0..rows).map(png).collect::<Result<_>>()?;
         columns.push((format!("{IMAGES}{}", frames.camera), Column::Png(files)));
     }

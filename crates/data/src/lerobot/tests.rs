@@ -4,7 +4,6 @@ use crate::fixture::episode;
 use e2h_core::{Direction, Episode, Frames, Kind, Outcome};
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 mod check;
 mod hostile;
@@ -48,7 +47,9 @@ fn numbered(n: usize) -> Episode {
     let mut e = episode(3 + n);
     e.origin.episode = n as u32;
     e.state[0][0] = -(n as f32);
-    Arc::make_mut(&mut e.frames[0].images[0])[0] = n as u8;
+    let mut bytes = e.frames[0].image(0).unwrap().into_owned();
+    bytes[0] = n as u8;
+    e.frames[0].images[0] = bytes.into();
     e
 }
 

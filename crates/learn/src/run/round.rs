@@ -8,7 +8,7 @@ use crate::picture;
 use crate::policy_class::Trained;
 use crate::record::{Collection, Reversal};
 use crate::{Error, Result};
-use e2h_core::{Direction, Episode, Policy};
+use e2h_core::{Direction, Episode, ImageStore, Policy};
 use e2h_policy::{Critic, CriticReport, CriticTraining, train_critic};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -67,7 +67,10 @@ impl Run {
     /// When the simulation fails, or rollouts are to be kept and cannot be written.
     pub fn collect(&self, iteration: u32, hard: &dyn Policy, easy: &dyn Policy) -> Result<Collected> {
         let c = &self.config().closed_loop;
-        let collected = collect(self.envs(c.loops)?, hard, easy, c, &self.origin(iteration), &self.progress)?;
+        // A store of its own, which goes with the rollouts: few of them become segments.
+        let images = ImageStore::create(self.path())?;
+        let origin = self.origin(iteration);
+        let collected = collect(self.envs(c.loops)?, hard, easy, c, &origin, Some(&images), &self.progress)?;
         let place = folder(iteration, "rollouts");
         if c.keep_rollouts && !self.dir.join(&place).exists() {
             let mut all: Vec<&Episode> =
@@ -101,13 +104,17 @@ impl Run {
             candidates.iter().zip(&refined).map(|(e, r)| Reversal::new(e, r)).collect();
         self.dir.put_compact(&folder(iteration, "reversals.json"), &reversals)?;
         let hard_successes = rollouts.hard.iter().filter(|e| e.outcome.is_success()).count();
+        let keep = |mut episode: Episode| -> Result<Arc<Episode>> {
+            episode.store_images(self.dir.images())?;
+            Ok(Arc::new(episode))
+        };
         let easy: Vec<Arc<Episode>> = if c.train.easy_update_steps > 0 {
-            rollouts.easy.into_iter().flat_map(|e| self.easy_lessons(e)).map(Arc::new).collect()
+            rollouts.easy.into_iter().flat_map(|e| self.easy_lessons(e)).map(keep).collect::<Result<_>>()?
         } else {
             vec![]
         };
-        let segments: Vec<Arc<Episode>> =
-            refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty()).map(Arc::new).collect();
+        let segments = refined.into_iter().flat_map(|r| r.segments).filter(|s| !s.is_empty());
+        let segments: Vec<Arc<Episode>> = segments.map(keep).collect::<Result<_>>()?;
         let collection = Collection {
             cycles: c.closed_loop.cycles,
             hard_successes,

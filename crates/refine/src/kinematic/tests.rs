@@ -93,7 +93,7 @@ fn slow_motion_is_retimed_to_steps_of_5_mm() {
     for t in 5..15 {
         assert!((segment.state[t + 1][0] - segment.state[t][0] - 0.005).abs() < 1e-6);
         assert_eq!(segment.action[t][..7], segment.state[t + 1][..7]);
-        assert_eq!(segment.frames[0].image(t)[0], segment.source[t] as u8);
+        assert_eq!(segment.frames[0].image(t).unwrap()[0], segment.source[t] as u8);
     }
     assert_eq!((segment.source[5], segment.source[15]), (5, 25));
     assert_eq!(segment.state[15], e.state[25]);

@@ -1,9 +1,9 @@
 //! An episode as the page sees it, wherever it comes from.
 
 use crate::Result;
-use e2h_core::{Direction, Episode, Image, Kind, Origin, Outcome};
+use e2h_core::{Direction, Episode, Image, Kind, Origin, Outcome, Pixels};
 use e2h_data::lerobot::{ACTION_NAMES, STATE_NAMES, decode_png};
-use std::sync::Arc;
+use std::borrow::Cow;
 
 /// One column over time.
 pub(super) struct Series {
@@ -18,7 +18,7 @@ pub(super) struct Series {
 /// The pictures of one camera.
 pub(super) enum Pictures {
     /// The pixels of each row.
-    Raw(Vec<Arc<[u8]>>),
+    Raw(Vec<Pixels>),
     /// A PNG file per row.
     Png(Vec<Vec<u8>>),
 }
@@ -37,7 +37,7 @@ impl Camera {
         let (height, width) = (self.height, self.width);
         match &self.pictures {
             Pictures::Raw(images) => {
-                let data = images.get(row).map_or(vec![], |image| image.to_vec());
+                let data = images.get(row).map(Pixels::read).transpose()?.map_or(vec![], Cow::into_owned);
                 Ok(Image { height, width, data })
             }
             Pictures::Png(files) => {

@@ -17,6 +17,8 @@ use std::f64::consts::TAU;
 
 /// Furthest excursion that a configuration may ask for, m (one deviation): the arm's reach is 0.85 m.
 const LARGEST_M: f64 = 0.3;
+/// Furthest that the grip may be out of place, m (one deviation): pads are 2 cm wide.
+const LARGEST_GRIP_M: f64 = 0.03;
 /// Largest turn that a configuration may ask for, rad (one deviation).
 const LARGEST_RAD: f64 = 1.5;
 /// Sinusoids of one axis.
@@ -45,7 +47,13 @@ pub struct ExploreConfig {
     /// Part of the sideways excursion and of the turn that is left where the object is put down, in [0, 1]: how wide the
     /// region is that it may end in.
     pub release: f64,
-    /// Factor on all deviations from one iteration to the next.
+    /// Deviation of the place of the grip along the jaws, m: a rollout holds its hand off all that the policy asks for by as much, at
+    /// its goals too, so that it takes the object beside the usual place. Its reversal shows how an object that is held there is
+    /// brought to its goal; where all grips are the same, the hand alone seems to say where the object is. Not in pairs that
+    /// hold the object throughout.
+    #[serde(default)]
+    pub grip_m: f64,
+    /// Factor on the deviations of the excursion from one iteration to the next.
     pub growth: f64,
 }
 
@@ -61,6 +69,7 @@ impl Default for ExploreConfig {
             band_hz: [0.05, 0.3],
             ramp_m: 0.08,
             release: 1.0,
+            grip_m: 0.0,
             growth: 1.0,
         }
     }
@@ -78,6 +87,7 @@ impl ExploreConfig {
         };
         within("share", self.share, [0.0, 1.0], "");
         within("release", self.release, [0.0, 1.0], "");
+        within("grip_m", self.grip_m, [0.0, LARGEST_GRIP_M], " m");
         within("growth", self.growth, [0.5, 2.0], "");
         within("ramp_m", self.ramp_m, [0.001, 1.0], " m");
         let growth =
@@ -122,6 +132,8 @@ type Wave = (f64, f64, f64);
 pub(crate) struct Wander {
     ramp: f64,
     release: f64,
+    /// Place of the grip along the jaws, m.
+    grip: f64,
     /// Of x, y, z (m) and yaw (rad).
     axes: [[Wave; WAVES]; 4],
     /// Seconds that the excursion has run.
@@ -146,9 +158,12 @@ impl Wander {
                 (amplitude, low + (high - low) * rng.random::<f64>(), TAU * rng.random::<f64>())
             })
         });
+        // Drawn last, so that a run without it draws what it always did. Uniform, with the deviation asked for.
+        let grip = 3.0_f64.sqrt() * config.grip_m * rng.random_range(-1.0..=1.0);
         Self {
             ramp: config.ramp_m,
             release: config.release,
+            grip,
             axes,
             clock: 0.0,
             before: None,
@@ -157,7 +172,7 @@ impl Wander {
         }
     }
 
-    /// By how much the goal of the last step was displaced.
+    /// By how much the goal of the last step was displaced; the place of the grip is no part of it, as there is no way back from it.
     pub(crate) fn now(&self) -> e2h_core::Excursion {
         // Stored episodes are f32.
         self.now.map(|v| v as f32)
@@ -188,9 +203,11 @@ impl Wander {
             let wave = |&(amplitude, hz, phase): &Wave| amplitude * (TAU * hz * self.clock + phase).sin();
             *now = weight * axis.iter().map(wave).sum::<f64>();
         }
+        // Jaws close along the tool's y axis, and its z axis is the way it points.
+        let grip = if env.task().homes() { Vector3::new(self.grip, 0.0, 0.0) } else { Vector3::zeros() };
         let displaced = |[x, y, z, yaw]: [f64; 4]| {
-            let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
-            Pose::new(goal.position + Vector3::new(x, y, z), turn * goal.orientation)
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw) * goal.orientation;
+            Pose::new(goal.position + Vector3::new(x, y, z) + turn * grip, turn)
         };
         // As the object comes down it is brought to where it may lie, as it sits in the hand.
         if sim.touching() {
@@ -241,6 +258,7 @@ mod tests {
         assert!(wrong(|c| c.band_hz = [0.0, 0.05]).contains("band_hz"));
         assert!(wrong(|c| c.share = 1.5).contains("share: expected 0 to 1"));
         assert!(wrong(|c| c.ramp_m = 0.0).contains("ramp_m"));
+        assert!(wrong(|c| c.grip_m = 0.05).contains("grip_m: expected 0 to 0.03 m"));
         // 30 mm, doubled four times, are 480 mm.
         assert!(
             wrong(|c| c.growth = 2.0)

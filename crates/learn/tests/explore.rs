@@ -123,7 +123,7 @@ fn every_value_changes_what_is_collected() {
     let before = rows(&base);
     assert_eq!(before, rows(&base));
     type Change = fn(&mut ExploreConfig);
-    let changes: [(&str, Change); 7] = [
+    let changes: [(&str, Change); 8] = [
         ("enabled", |c| c.enabled = false),
         ("share", |c| c.share = 0.5),
         ("sideways_m", |c| c.sideways_m = 0.02),
@@ -131,6 +131,7 @@ fn every_value_changes_what_is_collected() {
         ("yaw_rad", |c| c.yaw_rad = 0.1),
         ("band_hz", |c| c.band_hz = [0.1, 0.3]),
         ("ramp_m", |c| c.ramp_m = 0.2),
+        ("grip_m", |c| c.grip_m = 0.005),
     ];
     for (name, change) in changes {
         let mut other = base.clone();
@@ -146,6 +147,37 @@ fn every_value_changes_what_is_collected() {
 
 fn rows_of(iteration: u32, explore: &ExploreConfig) -> Vec<e2h_core::Episode> {
     collected_in(iteration, explore.clone(), 2).rejected
+}
+
+#[test]
+fn the_grip_is_beside_the_usual_place_and_the_object_stays_there_in_the_hand() {
+    let still = ExploreConfig {
+        enabled: true,
+        sideways_m: 0.0,
+        up_m: 0.0,
+        yaw_rad: 0.0,
+        grip_m: 0.006,
+        ..ExploreConfig::default()
+    };
+    // Where the object is in the hand at the end, along the jaws.
+    let held = |explore: &ExploreConfig| -> Vec<f32> {
+        let all = collected(explore.clone(), 2).rejected;
+        all.iter()
+            .map(|e| {
+                let t = e.len() - 1;
+                assert_eq!(e.excursion[t], [0.0; 4], "there is no way back from a grip");
+                let object: Vec<f64> = e.state[t][7..10].iter().map(|&v| f64::from(v)).collect();
+                let tool = e.eef(t);
+                let there = nalgebra::Vector3::from_column_slice(&object) - tool.position;
+                (tool.orientation.inverse() * there).x as f32
+            })
+            .collect()
+    };
+    assert!(held(&ExploreConfig::default()).iter().all(|x| x.abs() < 0.003));
+    let beside = held(&still);
+    assert!(beside.iter().all(|x| x.abs() < 0.006 * 1.74 + 0.003), "{beside:?}");
+    assert!(beside.iter().any(|x| x.abs() > 0.003), "{beside:?}");
+    assert!(beside.iter().any(|x| (x - beside[0]).abs() > 0.002), "{beside:?}");
 }
 
 #[test]

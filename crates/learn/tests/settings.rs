@@ -201,6 +201,7 @@ const CHANGES: &[Change] = &[
     ("loop.explore.band_hz", Err(EXPLORE)),
     ("loop.explore.ramp_m", Err(EXPLORE)),
     ("loop.explore.release", Err(EXPLORE)),
+    ("loop.explore.grip_m", Err(EXPLORE)),
     ("loop.explore.growth", Err(EXPLORE)),
     ("policy.n_obs_steps", Ok((Train, "1"))),
     ("policy.n_image_steps", Ok((Train, "2"))),

@@ -60,7 +60,7 @@ fn program() -> anyhow::Result<()> {
     }
     let mut published = Published::open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
     let compute = Compute::open(&a.device, published.config.device)?;
-    published.policy = published.policy.on(&compute)?;
+    published.policy = published.policy.into_device(&compute)?;
     let parallel = published.config.evaluation.parallel.min(a.trials);
     let progress = Progress::new(a.json);
     let (policy, direction) = (&published.policy, published.direction);

@@ -31,7 +31,7 @@ pub struct RunConfig {
     /// Architecture of both policies.
     pub policy: PolicyConfig,
     /// Their training.
-    pub train: StageConfig,
+    pub train: PolicyTraining,
     /// What becomes of reversed episodes.
     pub refine: RefineConfig,
     /// The critic.
@@ -127,7 +127,7 @@ pub enum UpdateFrom {
 /// Training steps and how a step looks.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct StageConfig {
+pub struct PolicyTraining {
     /// Steps of the easy policy.
     pub easy_steps: usize,
     /// Steps of the initial hard policy.

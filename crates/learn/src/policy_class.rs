@@ -142,7 +142,7 @@ impl Training for DiffusionTraining<'_> {
     fn policy(&self) -> Result<Box<dyn Trained>> {
         let (config, weights) = (&self.job.config.policy, self.trainer.weights()?);
         let policy = DiffusionPolicy::with_weights(config, self.job.normaliser, &weights)?;
-        Ok(Box::new(policy.on(self.job.compute)?))
+        Ok(Box::new(policy.into_device(self.job.compute)?))
     }
 }
 
@@ -154,13 +154,13 @@ impl PolicyClass for Diffusion {
     fn train<'a>(&self, job: Job<'a>) -> Result<Box<dyn Training + 'a>> {
         let (policy, step) = (&job.config.policy, &job.config.train.step);
         let data = TrainingData::new(job.sources, policy, job.normaliser)?;
-        let trainer =
-            Trainer::new(policy, step, job.steps, job.start, job.seed, job.purpose)?.on(job.compute)?;
+        let trainer = Trainer::new(policy, step, job.steps, job.start, job.seed, job.purpose)?
+            .into_device(job.compute)?;
         Ok(Box::new(DiffusionTraining { trainer, data, job }))
     }
 
     fn load(&self, folder: &Path, compute: &Compute) -> Result<Box<dyn Trained>> {
         let (policy, _) = DiffusionPolicy::load(folder).map_err(Error::from)?;
-        Ok(Box::new(policy.on(compute)?))
+        Ok(Box::new(policy.into_device(compute)?))
     }
 }

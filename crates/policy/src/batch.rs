@@ -21,7 +21,7 @@ pub(crate) enum Rows<'a> {
 pub(crate) type Jitter = (f32, f32);
 
 /// State and images of a batch, growing sample by sample.
-pub(crate) struct Host {
+pub(crate) struct BatchBuilder {
     state: Vec<f32>,
     images: Vec<Vec<f32>>,
     samples: usize,
@@ -33,7 +33,7 @@ pub(crate) struct Host {
     side: usize,
 }
 
-impl Host {
+impl BatchBuilder {
     pub(crate) fn new(config: &PolicyConfig) -> Self {
         Self {
             state: vec![],

@@ -1,6 +1,6 @@
 //! The critic: how far along is this frame?
 
-use crate::batch::{Host, Rows};
+use crate::batch::{BatchBuilder, Rows};
 use crate::model::ConditionEncoder;
 use crate::train::{Skipped, sound};
 use crate::train_config::without_zero_clip;
@@ -94,15 +94,15 @@ impl Critic {
         Ok(self.params.import(&weights)?)
     }
 
-    fn forward(&self, host: Host, dropout: Option<&mut Rng>) -> Result<Tensor> {
-        let (state, images) = host.tensors(self.config.crop_size, self.params.compute().device())?;
+    fn forward(&self, batch: BatchBuilder, dropout: Option<&mut Rng>) -> Result<Tensor> {
+        let (state, images) = batch.tensors(self.config.crop_size, self.params.compute().device())?;
         let condition = self.condition.forward(&state, &images)?;
         Ok(self.head.forward(&condition, dropout)?)
     }
 
     fn push(
         &self,
-        host: &mut Host,
+        batch: &mut BatchBuilder,
         episode: &Episode,
         t: usize,
         augment: Option<(&mut Rng, f32)>,
@@ -110,7 +110,7 @@ impl Critic {
         let c = &self.config;
         let rows: Vec<usize> =
             (0..c.n_obs_steps).map(|k| (t + k + 1).saturating_sub(c.n_obs_steps)).collect();
-        host.push_state(Rows::Episode(episode, &rows), &self.normaliser, None);
+        batch.push_state(Rows::Episode(episode, &rows), &self.normaliser, None);
         if c.n_image_steps == 0 {
             return Ok(());
         }
@@ -134,7 +134,7 @@ impl Critic {
                 ))
             })?;
             for &row in &rows[c.n_obs_steps - c.n_image_steps..] {
-                host.push_image(camera, &frames.image(row)?, corner, c.crop_size, jitter);
+                batch.push_image(camera, &frames.image(row)?, corner, c.crop_size, jitter);
             }
         }
         Ok(())
@@ -153,12 +153,12 @@ impl Critic {
     pub fn evaluate(&self, episode: &Episode) -> Result<Vec<f32>> {
         let mut values = Vec::with_capacity(episode.len());
         let rows: Vec<usize> = (0..episode.len()).collect();
-        for batch in rows.chunks(64) {
-            let mut host = Host::new(&self.config);
-            for &t in batch {
-                self.push(&mut host, episode, t, None)?;
+        for some in rows.chunks(64) {
+            let mut batch = BatchBuilder::new(&self.config);
+            for &t in some {
+                self.push(&mut batch, episode, t, None)?;
             }
-            values.extend(self.forward(host, None)?.flatten_all()?.to_vec1::<f32>()?);
+            values.extend(self.forward(batch, None)?.flatten_all()?.to_vec1::<f32>()?);
         }
         Ok(values)
     }
@@ -231,17 +231,17 @@ pub fn train_critic(
     let mut skipped = Skipped::default();
     for step in 0..critic.steps {
         let mut rng = stream(seed, purpose, 0, step as u64);
-        let mut host = Host::new(&network.config);
+        let mut batch = BatchBuilder::new(&network.config);
         let mut targets = Vec::with_capacity(critic.batch);
         for _ in 0..critic.batch {
             // Trajectories first, then a row: long failures would outweigh short successes otherwise.
             let episode = training[rng.random_range(0..training.len())];
             let t = rng.random_range(0..episode.len());
-            network.push(&mut host, episode, t, Some((&mut rng, critic.colour_jitter)))?;
+            network.push(&mut batch, episode, t, Some((&mut rng, critic.colour_jitter)))?;
             targets.push(target(episode, t, horizon));
         }
         let target = Tensor::from_vec(targets, (critic.batch, 1), compute.device())?;
-        let loss = (network.forward(host, Some(&mut rng))? - target)?.sqr()?.mean_all()?;
+        let loss = (network.forward(batch, Some(&mut rng))? - target)?.sqr()?.mean_all()?;
         let value = loss.to_scalar::<f32>()?;
         if !value.is_finite() {
             return Err(Error::NotFinite { step, seed, loss: value });

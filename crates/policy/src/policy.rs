@@ -1,6 +1,6 @@
 //! A trained policy: observations in, action chunks out.
 
-use crate::batch::{Host, Rows};
+use crate::batch::{BatchBuilder, Rows};
 use crate::model::Widths;
 use crate::{Checkpoint, Ddim, DiffusionModel, Error, PolicyConfig, Provenance, Result, SamplerKind};
 use candle_core::Tensor;
@@ -44,7 +44,7 @@ impl DiffusionPolicy {
     ///
     /// # Errors
     /// When the device fails.
-    pub fn on(self, compute: &Compute) -> Result<Self> {
+    pub fn into_device(self, compute: &Compute) -> Result<Self> {
         if self.model.params.is_on(compute) {
             return Ok(self);
         }
@@ -177,13 +177,13 @@ impl DiffusionPolicy {
         }
         self.check(histories)?;
         let c = &self.config;
-        let mut host = Host::new(c);
+        let mut batch = BatchBuilder::new(c);
         for history in histories {
-            host.push_state(Rows::Observations(history), &self.normaliser, None);
+            batch.push_state(Rows::Observations(history), &self.normaliser, None);
             let first_image = c.n_obs_steps - c.n_image_steps;
             for camera in 0..c.cameras.len() {
                 for observation in &history[first_image..] {
-                    host.push_image(
+                    batch.push_image(
                         camera,
                         &observation.frames[camera].data,
                         c.centre_crop(),
@@ -194,7 +194,7 @@ impl DiffusionPolicy {
             }
         }
         let device = self.model.device();
-        let (state, images) = host.tensors(c.crop_size, device)?;
+        let (state, images) = batch.tensors(c.crop_size, device)?;
         let condition = self.model.condition(&state, &images)?;
         let x = denoise(&self.model, &self.ddim, c, ACTION_DIM, &condition, noise)?;
         let first = if c.lerobot_alignment { c.n_obs_steps - 1 } else { 0 };

@@ -1,6 +1,6 @@
 //! Training of a diffusion policy, one step at a time, exactly resumable.
 
-use crate::batch::{Host, Rows};
+use crate::batch::{BatchBuilder, Rows};
 use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Episode, Rng, stream};
@@ -172,7 +172,7 @@ impl Trainer {
     ///
     /// # Errors
     /// When the device fails.
-    pub fn on(self, compute: &Compute) -> Result<Self> {
+    pub fn into_device(self, compute: &Compute) -> Result<Self> {
         if self.model.params.is_on(compute) {
             return Ok(self);
         }
@@ -229,13 +229,13 @@ impl Trainer {
 
     fn loss(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Tensor> {
         let (c, t) = (&self.config, &self.train);
-        let mut host = Host::new(c);
+        let mut batch = BatchBuilder::new(c);
         let (per, rows) = (c.horizon * ACTION_DIM, t.conditions * t.noises);
         let mut clean = Vec::with_capacity(t.conditions * per);
         let mut mask = Vec::with_capacity(rows * c.horizon);
         let first_image = c.n_obs_steps - c.n_image_steps;
         for (episode, window) in data.batch(t.conditions, rng) {
-            host.push_state(
+            batch.push_state(
                 Rows::Episode(episode, &window.observations),
                 data.normaliser,
                 Some((t.observation_noise, rng)),
@@ -253,7 +253,7 @@ impl Trainer {
                         ))
                     })?;
                     for &row in &window.observations[first_image..] {
-                        host.push_image(camera, &frames.image(row)?, corner, c.crop_size, None);
+                        batch.push_image(camera, &frames.image(row)?, corner, c.crop_size, None);
                     }
                 }
             }
@@ -284,7 +284,7 @@ impl Trainer {
             }
         }
         let device = self.model.device();
-        let (state, images) = host.tensors(c.crop_size, device)?;
+        let (state, images) = batch.tensors(c.crop_size, device)?;
         let mut condition = repeat_rows(&self.model.condition(&state, &images)?, t.noises)?;
         if keep.contains(&0.0) {
             condition = condition.broadcast_mul(&Tensor::from_vec(keep, (rows, 1), device)?)?;

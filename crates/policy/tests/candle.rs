@@ -91,9 +91,9 @@ fn training_and_sampling_are_the_same() {
         let sources = [e2h_data::Source::whole(episodes.to_vec())];
         let data = TrainingData::new(&sources, &config, &normaliser).unwrap();
         let run = || {
-            // What `on` is for on a GPU machine: made on the CPU, moved.
+            // What `into_device` is for on a GPU machine: made on the CPU, moved.
             let trainer = Trainer::new(&config, &train_config(), 8, None, 1, "candle").unwrap();
-            let mut trainer = trainer.on(&here()).unwrap();
+            let mut trainer = trainer.into_device(&here()).unwrap();
             let losses: Vec<f32> = (0..5).map(|_| trainer.step(&data).unwrap()).collect();
             (losses, trainer)
         };
@@ -107,7 +107,7 @@ fn training_and_sampling_are_the_same() {
             [3, 17].map(|t| vec![observation(t), observation(t + 1)]).into();
         let chunk = || {
             let policy = DiffusionPolicy::with_weights(&config, &normaliser, &weights).unwrap();
-            let policy = policy.on(&here()).unwrap();
+            let policy = policy.into_device(&here()).unwrap();
             let histories: Vec<Vec<&Observation>> = histories.iter().map(|h| h.iter().collect()).collect();
             let mut rngs = [stream(0, "act", 0, 0), stream(0, "act", 0, 1)];
             let chunks = policy.sample(&histories, &mut rngs).unwrap();
@@ -143,7 +143,7 @@ fn a_training_moves() {
     }
     let before = moves.weights().unwrap();
     let (after, loss) = elsewhere(|| {
-        let mut moved = moves.on(&here()).unwrap();
+        let mut moved = moves.into_device(&here()).unwrap();
         (moved.weights().unwrap(), moved.step(&data).unwrap())
     });
     assert_eq!(before, after);

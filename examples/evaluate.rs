@@ -79,6 +79,7 @@ fn program() -> anyhow::Result<()> {
         let line = serde_json::json!({
             "task": task,
             "trials": result.trials,
+            "outcomes": result.outcomes,
             "successes": result.successes,
             "wilson95": result.wilson95,
             "seconds": result.seconds,

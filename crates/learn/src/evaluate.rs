@@ -1,20 +1,11 @@
 //! Success of a policy over trials at fixed seeds.
 
-use crate::record::{Evaluation, wilson95};
+use crate::record::{Evaluation, Trial};
 use crate::rollout::{self, Film, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Image, Outcome, Policy, stream};
 use e2h_env::Env;
 use std::time::Instant;
-
-/// How one trial went.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Trial {
-    /// How it ended.
-    pub outcome: Outcome,
-    /// Control steps it took.
-    pub steps: usize,
-}
 
 /// Which trials of an evaluation are shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,10 +30,8 @@ pub struct Filming {
 /// What an evaluation left.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Evaluated {
-    /// Successes of trials.
+    /// Successes, and every trial.
     pub evaluation: Evaluation,
-    /// Every trial, in order.
-    pub trials: Vec<Trial>,
     /// One film a filmed trial, in the order of [`Filmed`].
     pub films: Vec<(Outcome, Vec<Image>)>,
 }
@@ -153,15 +142,7 @@ pub fn evaluate(
             }
         }
     }
-    let successes: Vec<usize> = results.iter().filter(|t| t.outcome.is_success()).map(|t| t.steps).collect();
-    let k = successes.len();
-    bar.finish(&format!("{k} of {trials} succeeded"));
-    let evaluation = Evaluation {
-        successes: k,
-        trials,
-        wilson95: wilson95(k, trials),
-        mean_steps: if k == 0 { 0.0 } else { successes.iter().sum::<usize>() as f64 / k as f64 },
-        seconds: start.elapsed().as_secs_f64(),
-    };
-    Ok(Evaluated { evaluation, trials: results, films })
+    let evaluation = Evaluation::new(results, start.elapsed().as_secs_f64());
+    bar.finish(&format!("{} of {trials} succeeded", evaluation.successes));
+    Ok(Evaluated { evaluation, films })
 }

@@ -37,7 +37,7 @@ pub use e2h_report::{self as report, record, tensorboard, view};
 pub use collect::{Collected, collect};
 pub use config::{Resolved, RunConfig};
 pub use error::{Error, Result};
-pub use evaluate::{Evaluated, Filmed, Filming, Trial, evaluate};
+pub use evaluate::{Evaluated, Filmed, Filming, evaluate};
 pub use explore::ExploreConfig;
 pub use method::{Lesson, Method, Round, Tools};
 pub use policy_class::{Diffusion, Job, PolicyClass, Trained, Training};

@@ -12,7 +12,7 @@
 //!
 //! let row = |iteration: u32, successes| IterationRecord {
 //!     iteration,
-//!     evaluation: Evaluation { successes, trials: 50, wilson95: wilson95(successes, 50), mean_steps: 180.0, seconds: 60.0 },
+//!     evaluation: Evaluation { successes, trials: 50, wilson95: wilson95(successes, 50), mean_steps: 180.0, seconds: 60.0, outcomes: vec![] },
 //!     minutes: 12.0 * f64::from(iteration + 1),
 //!     stage_minutes: [("train".to_owned(), 9.0)].into(),
 //!     collection: None,

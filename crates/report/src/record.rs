@@ -1,5 +1,6 @@
 //! What a run measured: the rows of the success curve and everything that is written as `results.json`.
 
+use e2h_core::Outcome;
 use e2h_refine::{Fate, Refined};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -17,6 +18,35 @@ pub struct Evaluation {
     pub mean_steps: f64,
     /// Wall time, s.
     pub seconds: f64,
+    /// Every trial, in order; trial i of two evaluations with the same seed has the same start. Empty in records from before they were kept.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub outcomes: Vec<Trial>,
+}
+
+impl Evaluation {
+    /// The account of `outcomes`, which took `seconds` of wall time.
+    #[must_use]
+    pub fn new(outcomes: Vec<Trial>, seconds: f64) -> Self {
+        let steps: Vec<usize> = outcomes.iter().filter(|t| t.outcome.is_success()).map(|t| t.steps).collect();
+        let (successes, trials) = (steps.len(), outcomes.len());
+        Self {
+            successes,
+            trials,
+            wilson95: wilson95(successes, trials),
+            mean_steps: steps.iter().sum::<usize>() as f64 / successes.max(1) as f64,
+            seconds,
+            outcomes,
+        }
+    }
+}
+
+/// How one trial went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Trial {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Control steps it took.
+    pub steps: usize,
 }
 
 /// One row of the success curve. Row 0 is the initial policy (the paper's "iteration 1").

@@ -142,8 +142,14 @@ fn run(dir: &Path) -> Vec<Episode> {
     account.value = Some((0..90).map(|t| (t % 7 != 0).then_some(t as f32 / 90.0)).collect());
     put("iteration_01/reversals.json", serde_json::to_string(&[account]).unwrap());
     let kept: usize = refined.segments.iter().map(Episode::len).sum();
-    let evaluation =
-        Evaluation { successes: 3, trials: 4, wilson95: wilson95(3, 4), mean_steps: 90.0, seconds: 1.0 };
+    let evaluation = Evaluation {
+        successes: 3,
+        trials: 4,
+        wilson95: wilson95(3, 4),
+        mean_steps: 90.0,
+        seconds: 1.0,
+        outcomes: vec![],
+    };
     let record = IterationRecord {
         iteration: 1,
         evaluation,

@@ -197,6 +197,7 @@ mod tests {
                 wilson95: wilson95(k, 50),
                 mean_steps: 200.0,
                 seconds: 80.0,
+                outcomes: vec![],
             },
             minutes: 11.0 + 14.3 * i as f64,
             stage_minutes: [("train".to_owned(), 7.5)].into(),

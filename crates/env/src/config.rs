@@ -20,6 +20,9 @@ pub struct EnvConfig {
     pub max_goal_step_m: f64,
     /// Furthest that the goal orientation turns in one control step, rad.
     pub max_goal_step_rad: f64,
+    /// Control steps for which a policy's last goal is held before each of its chunks, while it thinks: a robot's pauses, in
+    /// collection and in evaluation. The chunk is an answer to what was seen before them. 0: the world waits for the policy.
+    pub latency: usize,
     /// Standard deviation of the joint noise round the home posture at a reset, rad.
     pub home_noise_rad: f64,
 }
@@ -34,6 +37,7 @@ impl Default for EnvConfig {
             hold_steps: 10,
             max_goal_step_m: 0.03,
             max_goal_step_rad: 0.15,
+            latency: 0,
             home_noise_rad: 0.01,
         }
     }

@@ -6,7 +6,9 @@
 
 use crate::Result;
 use crate::explore::Wander;
-use e2h_core::{Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng, stream};
+use e2h_core::{
+    ACTION_DIM, Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng, stream,
+};
 use e2h_env::{Env, Snapshot};
 use rayon::prelude::*;
 use std::collections::VecDeque;
@@ -82,11 +84,18 @@ impl Rollout {
         self
     }
 
-    /// Executes `chunk`; Some when the episode ended in it.
+    /// Executes `chunk`, after the goal at hand was held as long as the policy thought; Some when the episode ended in it.
     pub(crate) fn execute(&mut self, env: &mut Env, chunk: &[Action]) -> Result<Option<Finished>> {
-        for (i, action) in chunk.iter().enumerate() {
+        let held = self.held(env);
+        let waits = std::iter::repeat_n(None, env.config().latency);
+        let steps: Vec<Option<&Action>> = waits.chain(chunk.iter().map(Some)).collect();
+        for (i, asked) in steps.iter().enumerate() {
             let excursion = self.wander.as_ref().map(Wander::now);
-            let action = self.wander.as_mut().map_or(*action, |w| w.displace(env, action));
+            let action = match (asked, &mut self.wander) {
+                (None, _) => held,
+                (Some(action), None) => **action,
+                (Some(action), Some(wander)) => wander.displace(env, action),
+            };
             if let (Some(episode), Some(now)) = (&mut self.episode, self.history.back()) {
                 episode.push(now, &action)?;
                 if let (Some(row), Some(excursion)) = (episode.excursion.last_mut(), excursion) {
@@ -106,12 +115,24 @@ impl Rollout {
                 return Ok(Some(Finished { outcome, steps: self.steps, episode, film: self.film.take() }));
             }
             // Without a recording only the observations that the next policy call gets are worth rendering.
-            if self.episode.is_some() || i + self.history.len() >= chunk.len() {
+            if self.episode.is_some() || i + self.history.len() >= steps.len() {
                 self.history.pop_front();
                 self.history.push_back(env.observe()?);
             }
         }
         Ok(None)
+    }
+
+    /// The goal at hand as an action.
+    fn held(&self, env: &Env) -> Action {
+        let sim = env.sim();
+        // In the hemisphere of what was observed, so that no sign flips.
+        let near =
+            self.history.back().map_or([1.0, 0.0, 0.0, 0.0], |o| [3, 4, 5, 6].map(|i| f64::from(o.state[i])));
+        let mut action = [0.0; ACTION_DIM];
+        action[..7].copy_from_slice(&sim.goal().to_row(&near));
+        action[7] = f32::from(u8::from(sim.opens()));
+        action
     }
 }
 

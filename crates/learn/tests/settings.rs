@@ -181,6 +181,7 @@ const CHANGES: &[Change] = &[
     ("env.hold_steps", Ok((Demonstrate, "48"))),
     ("env.max_goal_step_m", Ok((Demonstrate, "0.004"))),
     ("env.max_goal_step_rad", Ok((Demonstrate, "0.0002"))),
+    ("env.latency", Ok((Collect, "2"))),
     ("env.home_noise_rad", Ok((Demonstrate, "0.02"))),
     ("loop.demonstrations", Ok((Demonstrate, "2"))),
     ("loop.iterations", Ok((Length, "2"))),

@@ -44,6 +44,7 @@ pub mod page;
 pub mod picture;
 mod png_image;
 pub mod record;
+pub mod statistics;
 mod svg;
 pub mod table;
 pub mod tensorboard;

@@ -35,6 +35,7 @@
 
 pub mod animation;
 pub mod chart;
+pub mod compare;
 pub mod curve;
 mod error;
 mod fate;

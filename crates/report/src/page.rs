@@ -48,12 +48,17 @@ pub fn html(results: &RunResults, config_toml: &str, pictures: &Pictures) -> Str
     }
     body += &section("Configuration", &format!("<pre tabindex=\"0\">{}</pre>", escape(config_toml)));
     body += &section("Provenance", &provenance(results));
+    document(&title, &body)
+}
+
+/// A whole page: `body` is HTML, `title` is not.
+pub(crate) fn document(title: &str, body: &str) -> String {
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
          <meta name=\"color-scheme\" content=\"light dark\">\n<title>{}</title>\n<style>\n{STYLE}</style>\n</head>\n\
          <body>\n<main>\n{body}</main>\n</body>\n</html>\n",
-        escape(&title)
+        escape(title)
     )
 }
 
@@ -90,12 +95,12 @@ fn share(e: &Evaluation) -> String {
     format!("{}/{} ({})", e.successes, e.trials, percent(e.successes as f64 / e.trials as f64))
 }
 
-fn section(title: &str, content: &str) -> String {
+pub(crate) fn section(title: &str, content: &str) -> String {
     format!("<section>\n<h2>{}</h2>\n{content}\n</section>\n", escape(title))
 }
 
 /// A drawing that may be scrolled sideways where the screen is narrow.
-fn figure(title: &str, svg: &str) -> String {
+pub(crate) fn figure(title: &str, svg: &str) -> String {
     let caption =
         if title.is_empty() { String::new() } else { format!("<figcaption>{}</figcaption>", escape(title)) };
     format!("<figure>{caption}<div class=\"scroll\" tabindex=\"0\">{svg}</div></figure>\n")
@@ -119,7 +124,7 @@ fn images(title: &str, images: &[(String, Vec<u8>)]) -> String {
 }
 
 /// A table whose first column names the row; cells are HTML.
-fn table(head: &[&str], rows: &[Vec<String>]) -> String {
+pub(crate) fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     let head: String = head.iter().map(|h| format!("<th scope=\"col\">{h}</th>")).collect();
     let body: String = rows
         .iter()

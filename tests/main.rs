@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot be set up should fail")]
 
 mod architecture; // the invariants of ARCHITECTURE.md that a program can check
+mod compare; // several methods on several pairs, stopped, in parts, with shared beginnings
 mod errors; // wrong input and trouble with files: a clear message, before any work, nothing lost
 mod examples; // every example binary with the smoke preset
 mod faults; // signals, closed pipes, flipped bits and a MuJoCo that cannot go on

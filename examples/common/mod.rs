@@ -102,6 +102,7 @@ fn options(task: &str) -> Result<RunOptions> {
         set,
         out: a.out,
         resume: a.resume,
+        initial_from: None,
         device: a.device,
         threads: a.threads,
         quiet: a.quiet,

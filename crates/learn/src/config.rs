@@ -277,6 +277,34 @@ impl RunConfig {
         r.advantage.horizon = self.env.horizon_hard;
     }
 
+    /// Whether demonstrations are recorded alike with both.
+    pub(crate) fn demonstrates_like(&self, other: &Self) -> bool {
+        self.task == other.task
+            && self.env == other.env
+            && self.policy.cameras == other.policy.cameras
+            && self.closed_loop.demonstrations == other.closed_loop.demonstrations
+    }
+
+    /// Whether a loop begins alike with both: the same demonstrations, policies before the first update, and trials of theirs. What only
+    /// the rounds depend on may differ.
+    pub(crate) fn begins_like(&self, other: &Self) -> bool {
+        let mut same = other.clone();
+        let (l, mine) = (&mut same.closed_loop, &self.closed_loop);
+        (l.iterations, l.cycles, l.loops) = (mine.iterations, mine.cycles, mine.loops);
+        (l.after_failure, l.homing, l.accumulate) = (mine.after_failure, mine.homing, mine.accumulate);
+        (l.base_share, l.keep_rollouts) = (mine.base_share, mine.keep_rollouts);
+        l.explore = mine.explore.clone();
+        let (t, mine) = (&mut same.train, &self.train);
+        (t.update_steps, t.update_from) = (mine.update_steps, mine.update_from);
+        t.easy_update_steps = mine.easy_update_steps;
+        let (r, mine) = (&mut same.refine, &self.refine);
+        r.kinematic_enabled = mine.kinematic_enabled;
+        (r.gate, r.goal) = (mine.gate.clone(), mine.goal.clone());
+        (r.advantage, r.suffix) = (mine.advantage.clone(), mine.suffix.clone());
+        same.critic = self.critic.clone();
+        same == *self
+    }
+
     /// Reads a resolved configuration that a run wrote.
     ///
     /// # Errors

@@ -101,6 +101,27 @@ fn sync(dir: &Path) -> Result<()> {
     File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
 }
 
+/// Regular files and folders of theirs, each synced; what else lies there, and what is on its way to its place, is left out.
+fn copy_folder(from: &Path, to: &Path, depth: usize) -> Result<()> {
+    std::fs::create_dir_all(to).map_err(io("creating", to))?;
+    for entry in std::fs::read_dir(from).map_err(io("reading", from))?.flatten() {
+        let (path, name) = (entry.path(), entry.file_name());
+        let Ok(kind) = entry.file_type() else { continue };
+        let own = name.to_string_lossy();
+        if TEMPORARY.iter().any(|t| own.starts_with(t)) || own.ends_with(UNFINISHED) {
+            continue;
+        }
+        let place = to.join(&name);
+        if kind.is_file() {
+            std::fs::copy(&path, &place).map_err(io("copying", &path))?;
+            File::open(&place).and_then(|f| f.sync_all()).map_err(io("syncing", &place))?;
+        } else if kind.is_dir() && depth > 0 {
+            copy_folder(&path, &place, depth - 1)?;
+        }
+    }
+    sync(to)
+}
+
 /// What a configuration of a run differs in from the one given; values count, not how they are written.
 enum Difference {
     None,
@@ -300,6 +321,17 @@ impl Directory {
         let mut sums = BTreeMap::new();
         self.sums(&beside_name, "", &mut sums)?;
         self.put_sealed(&format!("{beside_name}/{SUMS_FILE}"), &sums)?;
+        std::fs::rename(&beside, &place).map_err(io("renaming to", &place))?;
+        sync(place.parent().unwrap_or(Path::new(".")))
+    }
+
+    /// Copies a folder from elsewhere to `name`, whole or not at all.
+    pub(crate) fn copy(&self, from: &Path, name: &str) -> Result<()> {
+        let (beside, place) = (self.join(format!("{name}{UNFINISHED}")), self.join(name));
+        if beside.exists() {
+            std::fs::remove_dir_all(&beside).map_err(io("removing", &beside))?;
+        }
+        copy_folder(from, &beside, DEEPEST)?;
         std::fs::rename(&beside, &place).map_err(io("renaming to", &place))?;
         sync(place.parent().unwrap_or(Path::new(".")))
     }

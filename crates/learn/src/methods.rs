@@ -68,6 +68,11 @@ impl Entry {
     }
 }
 
+/// Whether the hard policy of a method begins with the reversed demonstrations and nothing else; false for one that is not built in.
+pub(crate) fn begins_with_reversals(name: &str) -> bool {
+    name != "hard-demos" && registry().iter().any(|m| m.name == name)
+}
+
 /// A method by name.
 ///
 /// # Errors

@@ -6,6 +6,7 @@
 mod measure;
 mod options;
 mod round;
+mod share;
 mod stage;
 mod train;
 
@@ -111,7 +112,7 @@ impl Run {
         let path = options.out.clone().unwrap_or_else(|| default_folder(&identity));
         let dir = Directory::open(&path, options.resume, &identity, &resolved, &*task)?;
         let progress = Progress::new(options.quiet).stopping(options.stop.clone());
-        Ok(Self {
+        let run = Self {
             options: options.clone(),
             resolved,
             dir,
@@ -122,7 +123,11 @@ impl Run {
             class,
             identity,
             env,
-        })
+        };
+        if let Some(other) = &options.initial_from {
+            run.take_over(other)?;
+        }
+        Ok(run)
     }
 
     /// The resolved configuration.

@@ -1,5 +1,6 @@
 //! What a run is started with.
 
+use crate::config::{Resolved, RunConfig};
 use crate::method::Method;
 use crate::methods;
 use crate::policy_class::PolicyClass;
@@ -26,6 +27,9 @@ pub struct RunOptions {
     pub out: Option<PathBuf>,
     /// Go on with a run directory that exists.
     pub resume: bool,
+    /// Another run's directory, whose finished stages before the loop are copied where they are what this run would make, byte for byte
+    /// but for the provenance of its policies: several methods may share them.
+    pub initial_from: Option<PathBuf>,
     /// Where networks are computed: `cpu`, `cuda` or `cuda:N`. Not part of a run: it may go on elsewhere, and its results may
     /// then differ in the last bits.
     pub device: String,
@@ -51,12 +55,22 @@ impl RunOptions {
             set: vec![],
             out: None,
             resume: false,
+            initial_from: None,
             device: "cpu".to_owned(),
             threads: None,
             quiet: false,
             tensorboard: false,
             stop: Stop::default(),
         }
+    }
+
+    /// The configuration that a run of a built-in pair has with these options: preset, task file, method and overrides.
+    ///
+    /// # Errors
+    /// An unknown task, preset, method or key (the nearest known one is named), values that do not fit together.
+    pub fn resolve(&self) -> Result<Resolved> {
+        let (_, values) = methods::find(&self.method)?.read()?;
+        RunConfig::resolve_with(&self.preset, &self.task, None, &values, &self.set)
     }
 }
 

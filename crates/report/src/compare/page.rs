@@ -109,6 +109,14 @@ fn rate(p: Pooled) -> String {
     format!("<b>{}/{}</b> {share} ({})", p.successes, p.trials, interval(wilson95(p.successes, p.trials)))
 }
 
+/// The same without the interval, where a table is wide.
+fn short(p: Pooled) -> String {
+    if p.trials == 0 {
+        return "–".to_owned();
+    }
+    format!("{}/{} {}", p.successes, p.trials, percent(p.successes as f64 / p.trials as f64))
+}
+
 /// First and last policy a suite, beside the paper's.
 fn pooled(c: &Comparison) -> String {
     let mut rows = vec![];
@@ -117,7 +125,7 @@ fn pooled(c: &Comparison) -> String {
             continue;
         }
         let ran: Vec<&str> = c.tasks().into_iter().filter(|t| suite.tasks.contains(t)).collect();
-        let name = format!("{} <small>{} of {} pairs</small>", suite.name, ran.len(), suite.tasks.len());
+        let name = format!("{} <small>{} of {}</small>", suite.name, ran.len(), suite.tasks.len());
         for method in c.methods() {
             let runs =
                 || c.runs.iter().filter(|r| r.results.method == method && ran.contains(&&*r.results.task));
@@ -127,21 +135,21 @@ fn pooled(c: &Comparison) -> String {
             let figure = suite.paper.iter().find(|f| f.method == method);
             let paper = |k: Option<usize>| {
                 figure
-                    .and_then(|f| Some(rate(Pooled { successes: k?, trials: f.trials })))
+                    .and_then(|f| Some(short(Pooled { successes: k?, trials: f.trials })))
                     .unwrap_or("–".to_owned())
             };
             rows.push(vec![
                 name.clone(),
                 escape(method),
-                rate(Pooled::of(runs().map(|r| &r.initial))),
+                short(Pooled::of(runs().map(|r| &r.initial))),
                 rate(Pooled::of(runs().map(|r| &r.last))),
                 paper(figure.and_then(|f| f.initial)),
                 paper(figure.map(|f| f.last)),
             ]);
         }
     }
-    let head = ["suite", "method", "initial", "last", "paper, initial", "paper, last"];
-    let note = "<p class=\"note\">k/n over pairs and training seeds, with 95% Wilson intervals of the pooled trials: they describe these \
+    let head = ["suite, pairs", "method", "initial", "last", "paper: initial", "last"];
+    let note = "<p class=\"note\">k/n over the pairs of a suite that ran and their training seeds, with 95% Wilson intervals of the pooled trials: they describe these \
                 policies, not how a method varies. The paper's pairs, robots and budgets are not ours; its figures are single runs.</p>";
     table(&head, &rows) + note
 }
@@ -239,7 +247,7 @@ fn policies(c: &Comparison, task: &str) -> String {
         "McNemar p, Holm",
         "minutes",
     ];
-    let note = "<p class=\"note\">Only it, only reference: trials in which one of the two succeeded. Best on the way is over the run's own \
+    let note = "<p class=\"note\">p of McNemar's test (mid-p). Only it, only reference: trials in which one of the two succeeded. Best on the way is over the run's own \
                 trials, chosen afterwards, and counts for nothing.</p>";
     table(&head, &rows) + note
 }

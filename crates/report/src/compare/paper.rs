@@ -48,7 +48,7 @@ const SUITES: [Suite; 3] = [
         ],
     },
     Suite {
-        name: "real robots (simulated here)",
+        name: "real, simulated here",
         tasks: &["brush", "disk", "mouse", "test_tube"],
         paper: &[
             figure("auto-e2h", Some(32), 56, 80),

@@ -10,13 +10,27 @@ pub struct Source {
     pub episodes: Vec<Arc<Episode>>,
     /// Share of every batch, relative to those of the other sources; whatever it is, a source without episodes gives none.
     pub share: f32,
+    /// What a policy is told of the source while it learns (1 for what it shall do, -1 for what not); none tells nothing.
+    pub label: Option<f32>,
 }
 
 impl Source {
+    /// Episodes with their share of every batch, without a label.
+    #[must_use]
+    pub fn new(episodes: Vec<Arc<Episode>>, share: f32) -> Self {
+        Self { episodes, share, label: None }
+    }
+
     /// The only source: all of every batch comes from it.
     #[must_use]
     pub fn whole(episodes: Vec<Arc<Episode>>) -> Self {
-        Self { episodes, share: 1.0 }
+        Self::new(episodes, 1.0)
+    }
+
+    /// The same source with a label.
+    #[must_use]
+    pub fn labelled(self, label: f32) -> Self {
+        Self { label: Some(label), ..self }
     }
 }
 

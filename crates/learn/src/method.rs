@@ -109,6 +109,6 @@ pub trait Method: Send + Sync {
         let share = config.closed_loop.base_share;
         let first = if config.closed_loop.accumulate { 0 } else { segments.len().saturating_sub(1) };
         let episodes = segments[first..].iter().flat_map(|s| s.iter().cloned()).collect();
-        vec![Source { episodes: demonstrations.hard.clone(), share }, Source { episodes, share: 1.0 - share }]
+        vec![Source::new(demonstrations.hard.clone(), share), Source::new(episodes, 1.0 - share)]
     }
 }

@@ -93,7 +93,8 @@ pub struct PolicyConfig {
     pub train_timesteps: usize,
     /// DDIM steps in sampling.
     pub inference_steps: usize,
-    /// Guidance weight: 1 is fully conditional sampling; others need `conditioning_dropout` in training.
+    /// Guidance weight: 1 is fully conditional sampling; others need `conditioning_dropout` in training, or with `indicator`
+    /// `indicator_dropout`.
     pub guidance: f32,
     // What follows has come later: checkpoints from before say nothing of it, and those of today only where it matters.
     /// How noise becomes actions.
@@ -114,6 +115,14 @@ pub struct PolicyConfig {
     /// What follows the convolutions of the image encoder.
     #[serde(default, skip_serializing_if = "is_default")]
     pub encoder_norm: EncoderNorm,
+    /// True: the condition's last entry c says what is known of a source of training data ([`Source::label`](e2h_data::Source),
+    /// 0 where nothing is); in sampling c = 1. With it `guidance` is the weight of c alone: the unconditional pass sees the
+    /// observation, with c = 0.
+    ///
+    /// # Source
+    /// The improvement indicator of RECAP, pi*0.6, arXiv 2511.14759, section V; guidance in its appendix F.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub indicator: bool,
 }
 
 /// An object that rolled off the table would otherwise drive a network to where no data ever were.
@@ -176,6 +185,7 @@ impl PolicyConfig {
             image_scaling: vec![],
             tool_frame_features: false,
             encoder_norm: EncoderNorm::Group,
+            indicator: false,
         }
     }
 
@@ -194,7 +204,8 @@ impl PolicyConfig {
 
     /// The same for states of `state` numbers.
     pub(crate) fn condition_width(&self, state: usize) -> usize {
-        self.n_obs_steps * state + self.n_image_steps * self.cameras.len() * self.image_features
+        let images = self.n_image_steps * self.cameras.len() * self.image_features;
+        self.n_obs_steps * state + images + usize::from(self.indicator)
     }
 
     /// Sizes of an encoder for crops of `rows` by `columns`.

@@ -69,7 +69,12 @@ impl Critic {
     }
 
     fn config(policy: &PolicyConfig, critic: &CriticConfig) -> PolicyConfig {
-        PolicyConfig { crop_size: critic.crop_size, encoder_norm: EncoderNorm::Group, ..policy.clone() }
+        PolicyConfig {
+            crop_size: critic.crop_size,
+            encoder_norm: EncoderNorm::Group,
+            indicator: false,
+            ..policy.clone()
+        }
     }
 
     fn parts(

@@ -30,11 +30,11 @@ impl ConditionEncoder {
         Ok(Self { encoders, config: config.clone(), state })
     }
 
-    /// The condition vector.
+    /// The condition vector, less the indicator.
     ///
     /// # Shapes
     /// `state` (B, To * S); `images` one tensor a camera, each (B * `n_image_steps`, H, W, 3) in [0, 1], the steps of one
-    /// sample together, oldest first. Result (B, condition).
+    /// sample together, oldest first. Result (B, condition), one less with an indicator.
     ///
     /// # Source
     /// Order of LeRobot 0.4.4 `_prepare_global_conditioning`: for each step the state, then each camera's features.
@@ -154,16 +154,28 @@ impl DiffusionModel {
         self.params.compute().device()
     }
 
-    /// The condition vector of observation histories.
+    /// The condition vector of observation histories, less the indicator, which [`DiffusionModel::indicate`] appends.
     ///
     /// # Shapes
     /// `state` (B, To * S) normalised; `images` one tensor a camera, (B * `n_image_steps`, H, W, 3) in [0, 1]. Result
-    /// (B, condition).
+    /// (B, condition), one less with an indicator.
     ///
     /// # Errors
     /// When shapes do not fit the configuration.
     pub fn condition(&self, state: &Tensor, images: &[Tensor]) -> Result<Tensor> {
         self.condition.forward(state, images)
+    }
+
+    /// Appends the indicators to a condition without them.
+    ///
+    /// # Shapes
+    /// `condition` (B, condition - 1), `indicators` (B). Result (B, condition).
+    ///
+    /// # Errors
+    /// When the shapes do not fit.
+    pub fn indicate(&self, condition: &Tensor, indicators: &[f32]) -> Result<Tensor> {
+        let column = Tensor::from_slice(indicators, (indicators.len(), 1), self.device())?;
+        Ok(Tensor::cat(&[condition, &column], 1)?)
     }
 
     /// The network's answer to noisy actions.
@@ -176,4 +188,18 @@ impl DiffusionModel {
     pub fn forward(&self, x: &Tensor, timesteps: &[f32], condition: &Tensor) -> Result<Tensor> {
         Ok(self.unet.forward(x, timesteps, condition)?)
     }
+}
+
+/// Weights of the network without an indicator as those of `config`, which has one: whatever reads the condition gets a last
+/// column of zeros, so that the network answers as before to every c. Other weights stay as they are.
+pub(crate) fn widened(config: &PolicyConfig, weights: &Weights) -> Weights {
+    let before = (config.step_embed_dim + config.condition_dim()).saturating_sub(1).max(1);
+    let mut weights = weights.clone();
+    let reads = |name: &str| name.ends_with(".cond_encoder.1.weight");
+    for (_, tensor) in weights.iter_mut().filter(|(name, t)| reads(name) && t.shape.get(1) == Some(&before)) {
+        let rows = tensor.data.chunks_exact(before);
+        tensor.data = rows.flat_map(|row| row.iter().copied().chain([0.0])).collect();
+        tensor.shape[1] += 1;
+    }
+    weights
 }

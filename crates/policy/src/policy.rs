@@ -219,7 +219,7 @@ impl DiffusionPolicy {
 /// From noise to normalised actions.
 ///
 /// # Shapes
-/// `condition` (B, condition), result (B, T, `action_dim`) in a row.
+/// `condition` (B, condition), one less with an indicator; result (B, T, `action_dim`) in a row.
 pub(crate) fn denoise(
     model: &DiffusionModel,
     ddim: &Ddim,
@@ -232,11 +232,17 @@ pub(crate) fn denoise(
     let mut x = vec![0.0; b * c.horizon * action_dim];
     noise(&mut x);
     let mut fresh = vec![];
-    let free = (c.guidance != 1.0).then(|| condition.zeros_like()).transpose()?;
+    let guided = c.guidance != 1.0;
+    let (condition, free) = if c.indicator {
+        let indicate = |value: f32| model.indicate(condition, &vec![value; b]);
+        (indicate(1.0)?, guided.then(|| indicate(0.0)).transpose()?)
+    } else {
+        (condition.clone(), guided.then(|| condition.zeros_like()).transpose()?)
+    };
     for step in ddim.steps() {
         let timesteps = vec![step.timestep as f32; b];
         let input = Tensor::from_slice(&x, (b, c.horizon, action_dim), model.device())?;
-        let mut output = model.forward(&input, &timesteps, condition)?;
+        let mut output = model.forward(&input, &timesteps, &condition)?;
         if let Some(free) = &free {
             // Source: classifier-free guidance, arXiv 2207.12598, equation 6 in the form u + w (c - u).
             let unconditional = model.forward(&input, &timesteps, free)?;

@@ -1,6 +1,7 @@
 //! Training of a diffusion policy, one step at a time, exactly resumable.
 
 use crate::batch::{BatchBuilder, Rows};
+use crate::model::widened;
 use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
 use e2h_core::{ACTION_DIM, Episode, Rng, stream};
@@ -12,11 +13,10 @@ use rand::Rng as _;
 use sha2::{Digest as _, Sha256};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
-use std::sync::Arc;
 
 /// What a policy learns from: windows of weighted sources, and how they are scaled.
 pub struct TrainingData<'a> {
-    sources: Vec<(&'a [Arc<Episode>], Windows)>,
+    sources: Vec<(&'a Source, Windows)>,
     sampler: Sampler,
     normaliser: &'a Normaliser,
 }
@@ -32,21 +32,21 @@ impl<'a> TrainingData<'a> {
             horizon: config.horizon,
             alignment: if config.lerobot_alignment { Alignment::LeRobot } else { Alignment::Paper },
         };
-        let windows: Vec<_> =
-            sources.iter().map(|s| (&s.episodes[..], Windows::new(&s.episodes, &window))).collect();
+        let windows: Vec<_> = sources.iter().map(|s| (s, Windows::new(&s.episodes, &window))).collect();
         let shares: Vec<_> = windows.iter().zip(sources).map(|((_, w), s)| (w, f64::from(s.share))).collect();
         let sampler = Sampler::new(&shares)?;
         Ok(Self { sources: windows, sampler, normaliser })
     }
 
-    fn batch(&self, size: usize, rng: &mut Rng) -> Vec<(&Episode, Window)> {
+    /// Windows of a batch with their episodes and what is known of their sources: the indicators, 0 where nothing is.
+    fn batch(&self, size: usize, rng: &mut Rng) -> Vec<(&Episode, Window, f32)> {
         let picks = self.sampler.batch(size, rng);
         picks
             .into_iter()
             .map(|pick| {
-                let (episodes, windows) = &self.sources[pick.source];
+                let (source, windows) = &self.sources[pick.source];
                 let window = windows.window(pick.window);
-                (&*episodes[window.episode], window)
+                (&*source.episodes[window.episode], window, source.label.unwrap_or_default())
             })
             .collect()
     }
@@ -98,6 +98,20 @@ impl Skipped {
     }
 }
 
+/// What the network is asked in a step, and the answer.
+///
+/// # Shapes
+/// `noisy` and `target` (rows, T, 8), `timesteps` (rows), `condition` (rows, condition), `mask` (rows, T); a row is one of the
+/// noises of one of the step's conditions.
+struct Batch {
+    noisy: Tensor,
+    timesteps: Vec<f32>,
+    condition: Tensor,
+    target: Tensor,
+    /// On the host, where the loss reads it.
+    mask: Tensor,
+}
+
 /// A policy in training: network, optimiser, average of the weights, step counter.
 pub struct Trainer {
     model: DiffusionModel,
@@ -117,7 +131,8 @@ pub struct Trainer {
 
 impl Trainer {
     /// A trainer at step 0 of `steps` (the length of the learning-rate schedule). `start` are the weights to continue from; without them they are drawn from `seed`. `purpose`
-    /// names the random streams (for example `train/hard/3`), so that two stages of a run never share one.
+    /// names the random streams (for example `train/hard/3`), so that two stages of a run never share one. A policy with an
+    /// indicator may start from the weights of one without: it acts as that one did until it learns otherwise.
     ///
     /// # Errors
     /// When the configuration does not fit together or `start` is of another network.
@@ -141,7 +156,11 @@ impl Trainer {
         }
         let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
         if let Some(weights) = start {
-            model.params.import(weights)?;
+            if config.indicator {
+                model.params.import(&widened(config, weights))?;
+            } else {
+                model.params.import(weights)?;
+            }
         } else if (train.keypoint_sharpness - 1.0).abs() > 0.0 {
             let mut weights = model.params.export()?;
             for (_, attention) in weights.iter_mut().filter(|(name, _)| name.ends_with("pool.nets.weight")) {
@@ -228,13 +247,20 @@ impl Trainer {
     }
 
     fn loss(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Tensor> {
+        let batch = self.draw(data, rng)?;
+        let output = self.model.forward(&batch.noisy, &batch.timesteps, &batch.condition)?;
+        Ok(mse(&output, &batch.target, Some(&batch.mask))?)
+    }
+
+    fn draw(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Batch> {
         let (c, t) = (&self.config, &self.train);
         let mut batch = BatchBuilder::new(c);
         let (per, rows) = (c.horizon * ACTION_DIM, t.conditions * t.noises);
         let mut clean = Vec::with_capacity(t.conditions * per);
         let mut mask = Vec::with_capacity(rows * c.horizon);
         let first_image = c.n_obs_steps - c.n_image_steps;
-        for (episode, window) in data.batch(t.conditions, rng) {
+        let mut indicators = Vec::with_capacity(rows);
+        for (episode, window, indicator) in data.batch(t.conditions, rng) {
             batch.push_state(
                 Rows::Episode(episode, &window.observations),
                 data.normaliser,
@@ -261,6 +287,7 @@ impl Trainer {
                 clean.extend(data.normaliser.normalise_action(&episode.action[row]));
             }
             for _ in 0..t.noises {
+                indicators.push(indicator);
                 mask.extend(window.mask.iter().map(|&m| if m { 1.0f32 } else { 0.0 }));
             }
         }
@@ -283,19 +310,31 @@ impl Trainer {
                 keep.push(if rng.random::<f32>() < t.conditioning_dropout { 0.0 } else { 1.0f32 });
             }
         }
+        if c.indicator {
+            // Last, so that all else is drawn as without it.
+            for indicator in &mut indicators {
+                if rng.random::<f32>() < t.indicator_dropout {
+                    *indicator = 0.0;
+                }
+            }
+        }
         let device = self.model.device();
         let (state, images) = batch.tensors(c.crop_size, device)?;
         let mut condition = repeat_rows(&self.model.condition(&state, &images)?, t.noises)?;
         if keep.contains(&0.0) {
             condition = condition.broadcast_mul(&Tensor::from_vec(keep, (rows, 1), device)?)?;
         }
+        if c.indicator {
+            condition = self.model.indicate(&condition, &indicators)?;
+        }
         let shape = (rows, c.horizon, ACTION_DIM);
-        let noisy = Tensor::from_vec(noisy, shape, device)?;
-        let target = Tensor::from_vec(target, shape, device)?;
-        // The loss reads the mask on the host.
-        let mask = Tensor::from_vec(mask, (rows, c.horizon), &Device::Cpu)?;
-        let output = self.model.forward(&noisy, &timesteps, &condition)?;
-        Ok(mse(&output, &target, Some(&mask))?)
+        Ok(Batch {
+            noisy: Tensor::from_vec(noisy, shape, device)?,
+            timesteps,
+            condition,
+            target: Tensor::from_vec(target, shape, device)?,
+            mask: Tensor::from_vec(mask, (rows, c.horizon), &Device::Cpu)?,
+        })
     }
 
     /// The averaged weights: the policy to act with.
@@ -373,6 +412,76 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use e2h_core::{Direction, Observation, Origin};
+    use e2h_data::NormaliserConfig;
+    use std::sync::Arc;
+
+    /// The last entry of every row's condition, its other entries, and what else was drawn.
+    fn drawn(config: &PolicyConfig, train: &TrainConfig, step: u64) -> (Vec<f32>, Vec<Vec<f32>>, Vec<f32>) {
+        let mut episode = Episode::new(Origin::demonstration("line", Direction::Hard, 0, 0), &[]);
+        for t in 0..30_u8 {
+            let x = f32::from(t) * 0.01;
+            let state = [x, -x, x, 0., 1., 0., 0., 0.3, x, 0.1, 1., 0., 0., 0., 0.08];
+            episode.push(&Observation { state, frames: vec![] }, &[x, x, x, 0., 1., 0., 0., 1.]).unwrap();
+        }
+        let normaliser = Normaliser::fit(&[episode.clone()], &NormaliserConfig::default()).unwrap();
+        // In this order in every batch: a half good, a quarter bad, a quarter that nobody says anything of.
+        let source = |share: f32| Source::new(vec![Arc::new(episode.clone())], share);
+        let sources = [source(0.5).labelled(1.0), source(0.25).labelled(-1.0), source(0.25)];
+        let data = TrainingData::new(&sources, config, &normaliser).unwrap();
+        let trainer = Trainer::new(config, train, 1, None, 1, "test").unwrap();
+        let batch = trainer.draw(&data, &mut stream(1, "test", 0, step)).unwrap();
+        let rows = batch.condition.to_vec2::<f32>().unwrap();
+        assert_eq!(rows[0].len(), config.condition_dim());
+        let observed = config.condition_dim() - usize::from(config.indicator);
+        let last = rows.iter().flat_map(|row| row[observed..].to_vec()).collect();
+        let observations = rows.iter().map(|row| row[..observed].to_vec()).collect();
+        let others = [&batch.noisy, &batch.target, &batch.mask].map(|t| t.flatten_all().unwrap());
+        let others = others.iter().flat_map(|t| t.to_vec1::<f32>().unwrap()).chain(batch.timesteps);
+        (last, observations, others.collect())
+    }
+
+    #[test]
+    fn the_last_entry_of_a_condition_is_its_sources_label_or_0_where_it_is_dropped() {
+        let plain = PolicyConfig { cameras: vec![], ..PolicyConfig::tiny() };
+        let config = PolicyConfig { indicator: true, ..plain.clone() };
+        let train = |indicator_dropout: f32, conditioning_dropout: f32| TrainConfig {
+            conditions: 16,
+            noises: 2,
+            conditioning_dropout,
+            indicator_dropout,
+            observation_noise: 0.1,
+            keypoint_sharpness: 1.0,
+            adam: crate::ScheduledAdam::default(),
+            schedule: crate::ScheduleConfig { kind: crate::ScheduleKind::Constant, lr: 1e-3, warmup: 0 },
+            ema: e2h_nn::EmaConfig::default(),
+        };
+        let said: Vec<f32> = [(1.0, 16), (-1.0, 8), (0.0, 8)].iter().flat_map(|&(c, n)| vec![c; n]).collect();
+        assert_eq!(drawn(&config, &train(0.0, 0.0), 0).0, said);
+        // Whether the observation is there is another draw, and does not touch it.
+        assert_eq!(drawn(&config, &train(0.0, 0.9), 0).0, said);
+
+        let (mut dropped, mut unseen, mut both, mut all) = (0, 0, 0, 0);
+        for step in 0..200 {
+            let train = train(0.3, 0.5);
+            let (last, observations, others) = drawn(&config, &train, step);
+            // All else is drawn as without an indicator.
+            assert_eq!((vec![], observations.clone(), others), drawn(&plain, &train, step));
+            for ((c, said), observation) in last.iter().zip(&said).zip(&observations).take(24) {
+                let (gone, blind) = (*c == 0.0, observation.iter().all(|v| *v == 0.0));
+                assert!(gone || c == said, "{c} for {said}");
+                dropped += u32::from(gone);
+                unseen += u32::from(blind);
+                both += u32::from(gone && blind);
+                all += 1;
+            }
+        }
+        // Of 4800; four standard deviations are 0.029 at most.
+        for (count, share) in [(dropped, 0.3), (unseen, 0.5), (both, 0.15)] {
+            let found = f64::from(count) / f64::from(all);
+            assert!((found - share).abs() < 0.03, "{found} for {share}");
+        }
+    }
 
     #[test]
     fn many_skipped_steps_in_a_row_end_a_training() {

@@ -16,6 +16,10 @@ pub struct TrainConfig {
     pub noises: usize,
     /// Probability that a sample's whole condition is zeroed.
     pub conditioning_dropout: f32,
+    /// Probability that a sample's indicator is set to 0, apart from its observation; without effect on policies without
+    /// [`PolicyConfig::indicator`]. Source: RECAP, arXiv 2511.14759, appendix F, 30 %.
+    #[serde(default = "indicator_dropout", skip_serializing_if = "is_indicator_dropout")]
+    pub indicator_dropout: f32,
     /// Standard deviation of the noise on normalised state entries in training.
     pub observation_noise: f32,
     /// Factor on the weights from which the keypoints' attention starts (the 1 x 1 convolution of the spatial softmax). At 1, as
@@ -68,6 +72,10 @@ impl TrainConfig {
         check(
             (0.0..1.0).contains(&self.conditioning_dropout),
             format!("conditioning_dropout: expected 0 to below 1, got {}", self.conditioning_dropout),
+        );
+        check(
+            (0.0..1.0).contains(&self.indicator_dropout),
+            format!("indicator_dropout: expected 0 to below 1, got {}", self.indicator_dropout),
         );
         check(
             (0.0..=10.0).contains(&self.observation_noise),
@@ -243,4 +251,15 @@ fn one() -> f32 {
 
 fn is_one(factor: &f32) -> bool {
     *factor == 1.0
+}
+
+/// RECAP's.
+const INDICATOR_DROPOUT: f32 = 0.3;
+
+fn indicator_dropout() -> f32 {
+    INDICATOR_DROPOUT
+}
+
+fn is_indicator_dropout(probability: &f32) -> bool {
+    *probability == INDICATOR_DROPOUT
 }

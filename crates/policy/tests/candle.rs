@@ -65,6 +65,7 @@ fn train_config() -> TrainConfig {
         conditions: 8,
         noises: 2,
         conditioning_dropout: 0.2,
+        indicator_dropout: 0.3,
         observation_noise: 0.05,
         keypoint_sharpness: 1.0,
         adam: ScheduledAdam { clip_norm: Some(1.0), ..Default::default() },
@@ -86,9 +87,13 @@ fn assert_near(what: &str, got: &[f32], want: &[f32], tolerance: f64) {
 fn training_and_sampling_are_the_same() {
     let episodes = [Arc::new(episode(40, true))];
     let normaliser = Normaliser::fit(&[episode(40, true)], &NormaliserConfig::default()).unwrap();
-    for (prediction, guidance) in [(Prediction::Sample, 1.0), (Prediction::Epsilon, 1.5)] {
-        let config = PolicyConfig { prediction, guidance, relative_features: true, ..PolicyConfig::tiny() };
-        let sources = [e2h_data::Source::whole(episodes.to_vec())];
+    for (prediction, guidance, indicator) in
+        [(Prediction::Sample, 1.0, false), (Prediction::Epsilon, 1.5, false), (Prediction::Sample, 1.5, true)]
+    {
+        let config =
+            PolicyConfig { prediction, guidance, indicator, relative_features: true, ..PolicyConfig::tiny() };
+        let whole = e2h_data::Source::whole(episodes.to_vec());
+        let sources = [whole.clone().labelled(1.0), whole.labelled(-1.0)];
         let data = TrainingData::new(&sources, &config, &normaliser).unwrap();
         let run = || {
             // What `into_device` is for on a GPU machine: made on the CPU, moved.

@@ -33,6 +33,7 @@ fn train_config() -> TrainConfig {
         conditions: 16,
         noises: 2,
         conditioning_dropout: 0.0,
+        indicator_dropout: 0.3,
         observation_noise: 0.0,
         keypoint_sharpness: 1.0,
         adam: ScheduledAdam { clip_norm: Some(1.0), ..Default::default() },

@@ -119,8 +119,8 @@ impl Run {
             iteration,
             steps,
             sources: vec![
-                Source { episodes: demonstrations.easy_training.clone(), share },
-                Source { episodes: own, share: 1.0 - share },
+                Source::new(demonstrations.easy_training.clone(), share),
+                Source::new(own, 1.0 - share),
             ],
             start: Some(&*easy),
         };

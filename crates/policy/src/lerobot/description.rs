@@ -239,6 +239,7 @@ pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
     ask(images == steps, "n_image_steps", format!("{steps}, as n_obs_steps"), images.to_string());
     ask(!c.relative_features, "relative_features", "false".to_owned(), "true".to_owned());
     ask(!c.tool_frame_features, "tool_frame_features", "false".to_owned(), "true".to_owned());
+    ask(!c.indicator, "indicator", "false".to_owned(), "true".to_owned());
     ask(
         c.encoder_width == BACKBONE_WIDTH,
         "encoder_width",

@@ -261,5 +261,6 @@ fn network(d: &Description, features: &Features, problems: &mut Vec<Obstacle>) -
         } else {
             EncoderNorm::Folded
         },
+        indicator: false,
     }
 }

@@ -1,9 +1,12 @@
 use auto_e2h::core::{Direction, Kind, Origin, stream};
+use auto_e2h::data::Source;
 use auto_e2h::data::lerobot::Dataset;
 use auto_e2h::env::{Env, demonstrate, task};
+use auto_e2h::learn::methods::Recap;
 use auto_e2h::learn::{
     Accepted, Collected, Json, Lesson, Method, Parts, Result, Round, Run, RunOptions, Tools,
 };
+use auto_e2h::policy::DiffusionPolicy;
 use auto_e2h::refine::Fate;
 use auto_e2h::report::folder::sealed;
 use std::collections::BTreeMap;
@@ -140,6 +143,73 @@ fn every_method_makes_its_own_lesson_of_the_same_rollouts() {
     for segment in &direct.segments {
         assert!(segment.origin.direction == Direction::Hard && !segment.origin.reversed);
     }
+}
+
+#[test]
+fn recap_learns_from_every_rollout_with_the_label_that_its_outcome_or_its_source_says() {
+    let dir = tempfile::tempdir().unwrap();
+    let open = |name: &str, set: &[&str], resume: bool| {
+        let mut options = options(&dir.path().join(name));
+        "recap".clone_into(&mut options.method);
+        options.set.push("train.initial_steps=2".to_owned());
+        options.set.extend(set.iter().map(|s| (*s).to_owned()));
+        options.resume = resume;
+        Run::open(&options).unwrap()
+    };
+    let run = open("run", &[], false);
+    let base = run.demonstrations().unwrap();
+    let hard = run.train_initial(&base).unwrap();
+    let collected = scripted(&run);
+    let rollouts = collected.hard.clone();
+    let made = run.lesson(1, &base, &*hard, || Ok(collected)).unwrap();
+    // Three successes and the first half of a fourth, whole and forwards; labels as those of reversals.
+    assert_eq!((made.segments.len(), made.collection.accepted), (4, 4));
+    for (segment, rollout) in made.segments.iter().zip(&rollouts) {
+        assert!(segment.origin.direction == Direction::Hard && !segment.origin.reversed);
+        assert_eq!((&segment.state, segment.outcome), (&rollout.state, rollout.outcome));
+        assert_eq!(segment.terminal, rollout.outcome.is_success());
+        assert_eq!(segment.action[3][..3], segment.state[4][..3], "the goal is the pose that followed");
+    }
+    let frames: usize = rollouts.iter().map(auto_e2h::core::Episode::len).sum();
+    let share = 100.0 * (frames - rollouts[3].len()) as f64 / frames as f64;
+    let note = format!("recap: 3 of 4 rollouts are positive, {share:.0} % of their frames");
+    assert_eq!(made.collection.notes, [note]);
+    assert!(made.collection.critic_loss.is_none());
+
+    // What another process reads back has the same labels: they are in what is stored.
+    drop(run);
+    let run = open("run", &[], true);
+    let read = run.lesson(1, &base, &*hard, || unreachable!("it is stored")).unwrap();
+    assert_eq!(read.segments, made.segments);
+    let rounds = [&read.segments[..], &made.segments[..]];
+    let rows = |s: &Source| s.episodes.iter().map(|e| e.len()).sum::<usize>() as f32;
+    let sources = Recap.sources(&base, &rounds, run.config());
+    let labels: Vec<_> = sources.iter().map(|s| (s.label, s.episodes.len())).collect();
+    // Two rounds, because what is accepted accumulates.
+    assert_eq!(labels, [(Some(1.0), base.hard.len()), (Some(1.0), 6), (Some(-1.0), 2)]);
+    assert!((sources[0].share - 0.5).abs() < 1e-6);
+    assert!((sources[1].share + sources[2].share - 0.5).abs() < 1e-6);
+    let (good, bad) = (sources[1].share / rows(&sources[1]), sources[2].share / rows(&sources[2]));
+    assert!((good / bad - 1.0).abs() < 1e-4, "a window of a rollout is as likely as any other: {good} {bad}");
+
+    let literal = open("source", &["recap.indicator=source", "loop.accumulate=false"], false);
+    let sources = Recap.sources(&base, &rounds, literal.config());
+    let labels: Vec<_> = sources.iter().map(|s| (s.label, s.episodes.len())).collect();
+    assert_eq!(labels, [(Some(1.0), base.hard.len()), (Some(1.0), 0), (Some(-1.0), 4)]);
+
+    // Updates have the indicator and what it is sampled with, from the first on; the policy before has not.
+    let policy = |place: &Path| DiffusionPolicy::load(place).unwrap().1.config;
+    assert!(!policy(&run.path().join("iteration_00/policy")).indicator);
+    drop(run);
+    let guided = open("guided", &["recap.guidance=2.0"], false);
+    guided.train_initial(&guided.demonstrations().unwrap()).unwrap();
+    let updated = guided.update(1, &*hard, &base, &[read]).unwrap();
+    let found = policy(&guided.path().join("iteration_01/policy"));
+    assert!(found.indicator && (found.guidance - 2.0).abs() < 1e-6, "{found:?}");
+    assert!((policy(&guided.path().join("iteration_00/policy")).guidance - 1.0).abs() < 1e-6);
+    // And the next goes on from there.
+    let again = guided.update(2, &*updated, &base, &[made]).unwrap();
+    assert_ne!(again.weights().unwrap(), updated.weights().unwrap());
 }
 
 #[test]

@@ -94,3 +94,32 @@ fn a_run_made_longer_goes_on_as_if_it_had_been_that_long() {
     let config = |run: &std::path::Path| std::fs::read_to_string(run.join("config.toml")).unwrap();
     assert_eq!(config(&whole), config(&longer));
 }
+
+/// Labels of what earlier rounds brought are made anew from the disk, and the initial policy is the one that all methods share.
+#[test]
+fn a_run_of_recap_goes_on_with_the_same_bytes_and_begins_as_every_other() {
+    let dir = tempfile::tempdir().unwrap();
+    let (whole, killed, usual) =
+        (dir.path().join("whole"), dir.path().join("killed"), dir.path().join("usual"));
+    let two = ["--method", "recap", "--set=loop.iterations=2"];
+    assert_success(&nut_assembly(&whole, &two).args(["--threads", "1"]).output().unwrap());
+    let mut child = nut_assembly(&killed, &two).stdout(std::process::Stdio::null()).spawn().unwrap();
+    while !killed.join("iteration_01/policy/notes.json").exists() {
+        assert!(child.try_wait().unwrap().is_none(), "it ended before it could be killed");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(!killed.join("iteration_02/policy/notes.json").exists(), "it was killed too late");
+    assert_success(&nut_assembly(&killed, &two).args(["--resume", "--threads", "2"]).output().unwrap());
+    assert_same_results(&whole, &killed);
+    assert_success(&nut_assembly(&usual, &["--set=loop.iterations=0"]).output().unwrap());
+    let bytes = |run: &std::path::Path, file: &str| std::fs::read(run.join(file)).unwrap();
+    let initial = "iteration_00/policy/model.safetensors";
+    assert!(bytes(&whole, initial) == bytes(&usual, initial));
+    let policy = |n: u32| {
+        let text = bytes(&whole, &format!("iteration_{n:02}/policy/policy.json"));
+        crate::text(&text).contains("\"indicator\": true")
+    };
+    assert_eq!([0, 1, 2].map(policy), [false, true, true]);
+}

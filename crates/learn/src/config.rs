@@ -2,6 +2,7 @@
 
 mod validate;
 
+use crate::methods::RecapConfig;
 use crate::{Error, ExploreConfig, Result};
 use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, Task, TaskOptions};
@@ -36,11 +37,18 @@ pub struct RunConfig {
     pub refine: RefineConfig,
     /// The critic.
     pub critic: CriticStage,
+    /// The method `recap`; without effect on others. Checkpoints say it where it differs from the default.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub recap: RecapConfig,
     /// Measuring success.
     pub evaluation: EvaluationConfig,
     /// How exact a GPU multiplies; without effect on the CPU. Checkpoints from before it have none.
     #[serde(default)]
     pub device: Precision,
+}
+
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
 }
 
 /// The task pair of a run.

@@ -3,6 +3,7 @@
 mod auto_e2h;
 mod direct_h;
 mod hard_demos;
+mod recap;
 
 use crate::{Error, Method, Result};
 use std::sync::Arc;
@@ -11,6 +12,7 @@ use toml::{Table, Value};
 pub use auto_e2h::{AutoE2h, candidates, filter};
 pub use direct_h::DirectH;
 pub use hard_demos::HardDemos;
+pub use recap::{Indicator, Recap, RecapConfig};
 
 /// A method as it is chosen: code, and values laid over preset and task file.
 #[derive(Debug, Clone, Copy)]
@@ -33,17 +35,18 @@ pub const DEFAULT: &str = "auto-e2h";
 /// All that `--method` can name, the default first.
 #[must_use]
 pub fn registry() -> &'static [Entry] {
-    entries!["auto-e2h", "auto-e2h-literal", "no-kinematic", "no-critic", "direct-h", "hard-demos"]
+    entries!["auto-e2h", "auto-e2h-literal", "no-kinematic", "no-critic", "direct-h", "hard-demos", "recap"]
 }
 
 /// Names of the code that a method file can ask for.
-const CODE: [&str; 3] = ["auto-e2h", "direct-h", "hard-demos"];
+const CODE: [&str; 4] = ["auto-e2h", "direct-h", "hard-demos", "recap"];
 
 fn code(name: &str) -> Option<Arc<dyn Method>> {
     match name {
         "auto-e2h" => Some(Arc::new(AutoE2h)),
         "direct-h" => Some(Arc::new(DirectH)),
         "hard-demos" => Some(Arc::new(HardDemos)),
+        "recap" => Some(Arc::new(Recap)),
         _ => None,
     }
 }

@@ -7,7 +7,7 @@ use crate::{Error, Result, RunConfig};
 use e2h_core::Policy;
 use e2h_data::{Normaliser, Source};
 use e2h_nn::{Compute, Weights};
-use e2h_policy::{DiffusionPolicy, Provenance, Trainer, TrainingData};
+use e2h_policy::{DiffusionPolicy, PolicyConfig, Provenance, Trainer, TrainingData};
 use std::path::Path;
 
 /// A policy that a run has trained.
@@ -30,7 +30,7 @@ pub trait Trained: Policy {
 pub struct Job<'a> {
     /// The run's configuration.
     pub config: &'a RunConfig,
-    /// What is learned from.
+    /// What is learned from. Labels are for classes that can be told of them; others ignore them.
     pub sources: &'a [Source],
     /// Scaling of states and actions.
     pub normaliser: &'a Normaliser,
@@ -98,7 +98,8 @@ pub trait PolicyClass: Send + Sync {
     fn load(&self, folder: &Path, compute: &Compute) -> Result<Box<dyn Trained>>;
 }
 
-/// The image-conditioned diffusion policy.
+/// The image-conditioned diffusion policy. Where sources have labels, it is a policy with an indicator
+/// ([`PolicyConfig::indicator`]), which may go on from one without.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Diffusion;
 
@@ -115,6 +116,7 @@ impl Trained for DiffusionPolicy {
 struct DiffusionTraining<'a> {
     trainer: Trainer,
     data: TrainingData<'a>,
+    policy: PolicyConfig,
     job: Job<'a>,
 }
 
@@ -140,8 +142,8 @@ impl Training for DiffusionTraining<'_> {
     }
 
     fn policy(&self) -> Result<Box<dyn Trained>> {
-        let (config, weights) = (&self.job.config.policy, self.trainer.weights()?);
-        let policy = DiffusionPolicy::with_weights(config, self.job.normaliser, &weights)?;
+        let weights = self.trainer.weights()?;
+        let policy = DiffusionPolicy::with_weights(&self.policy, self.job.normaliser, &weights)?;
         Ok(Box::new(policy.into_device(self.job.compute)?))
     }
 }
@@ -152,11 +154,17 @@ impl PolicyClass for Diffusion {
     }
 
     fn train<'a>(&self, job: Job<'a>) -> Result<Box<dyn Training + 'a>> {
-        let (policy, step) = (&job.config.policy, &job.config.train.step);
-        let data = TrainingData::new(job.sources, policy, job.normaliser)?;
-        let trainer = Trainer::new(policy, step, job.steps, job.start, job.seed, job.purpose)?
+        let mut policy = job.config.policy.clone();
+        // Whoever labels sources wants a policy that is told of it; without labels it stays the plain one.
+        if job.sources.iter().any(|s| s.label.is_some()) {
+            policy.indicator = true;
+            policy.guidance = job.config.recap.guidance;
+        }
+        let data = TrainingData::new(job.sources, &policy, job.normaliser)?;
+        let step = &job.config.train.step;
+        let trainer = Trainer::new(&policy, step, job.steps, job.start, job.seed, job.purpose)?
             .into_device(job.compute)?;
-        Ok(Box::new(DiffusionTraining { trainer, data, job }))
+        Ok(Box::new(DiffusionTraining { trainer, data, policy, job }))
     }
 
     fn load(&self, folder: &Path, compute: &Compute) -> Result<Box<dyn Trained>> {

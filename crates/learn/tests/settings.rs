@@ -86,6 +86,8 @@ fn values_that_contradict_each_other_are_refused() {
         (&["env.image_size=40"][..], "policy.image_size"),
         (&["env.cameras=false"], "env.cameras"),
         (&["policy.guidance=2.0"], "conditioning_dropout"),
+        (&["recap.guidance=2.0", "train.step.indicator_dropout=0.0"], "indicator_dropout"),
+        (&["recap.indicator=advantage"], "recap.indicator"),
         (&["env.hold_steps=301"], "hold_steps"),
         (&["critic.network.crop_size=33"], "crop_size"),
         (&["refine.gate.closings=3"], "closings"),
@@ -157,6 +159,8 @@ const BASE: &[&str] = &[
 ];
 
 const EXPLORE: &str = "policies of no training never move the object; tests/explore.rs has one that does";
+
+const RECAP: &str = "of the method recap alone; tests/pipeline.rs has what it changes there";
 
 const CHANGES: &[Change] = &[
     ("task.name", Err("each pair has its own program, and another name is refused")),
@@ -241,6 +245,7 @@ const CHANGES: &[Change] = &[
     ("train.step.conditions", Ok((Train, "9"))),
     ("train.step.noises", Ok((Train, "3"))),
     ("train.step.conditioning_dropout", Ok((Train, "0.9"))),
+    ("train.step.indicator_dropout", Err(RECAP)),
     ("train.step.observation_noise", Ok((Train, "0.2"))),
     ("train.step.keypoint_sharpness", Ok((Train, "2.0"))),
     ("train.step.adam.beta1", Ok((Train, "0.5"))),
@@ -306,6 +311,8 @@ const CHANGES: &[Change] = &[
     ("critic.network.adam.weight_decay", Ok((Refine, "1.0"))),
     ("critic.network.adam.decoupled", Ok((Refine, "true"))),
     ("critic.network.adam.clip_norm", Ok((Refine, "0.0001"))),
+    ("recap.indicator", Err(RECAP)),
+    ("recap.guidance", Err(RECAP)),
     ("evaluation.trials", Ok((Evaluate, "2"))),
     ("evaluation.seed", Ok((Evaluate, "7"))),
     ("evaluation.parallel", Err("how many trials the policy answers at once: changes last bits alone")),

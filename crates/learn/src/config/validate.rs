@@ -110,6 +110,11 @@ impl RunConfig {
                 p.guidance
             )
         });
+        let guidance = self.recap.guidance;
+        all.number("recap.guidance", guidance, 0.0, 100.0);
+        all.check(guidance == 1.0 || t.step.indicator_dropout > 0.0, || {
+            format!("recap.guidance: expected 1 with train.step.indicator_dropout = 0, got {guidance}")
+        });
         all.of("critic.network", self.critic.network.validate(p));
         for camera in p.cameras.iter().filter(|c| !CAMERAS.contains(&c.as_str())) {
             all.0.push(format!(

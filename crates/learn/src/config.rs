@@ -305,6 +305,8 @@ impl RunConfig {
         let (t, mine) = (&mut same.train, &self.train);
         (t.update_steps, t.update_from) = (mine.update_steps, mine.update_from);
         t.easy_update_steps = mine.easy_update_steps;
+        t.step.indicator_dropout = mine.step.indicator_dropout;
+        same.recap = self.recap.clone();
         let (r, mine) = (&mut same.refine, &self.refine);
         r.kinematic_enabled = mine.kinematic_enabled;
         (r.gate, r.goal) = (mine.gate.clone(), mine.goal.clone());

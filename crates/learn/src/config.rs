@@ -2,7 +2,7 @@
 
 mod validate;
 
-use crate::methods::RecapConfig;
+use crate::methods::{DynamicsStage, RecapConfig};
 use crate::{Error, ExploreConfig, Result};
 use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, Task, TaskOptions};
@@ -40,6 +40,9 @@ pub struct RunConfig {
     /// The method `recap`; without effect on others. Checkpoints say it where it differs from the default.
     #[serde(default, skip_serializing_if = "is_default")]
     pub recap: RecapConfig,
+    /// The method `tr-drl-dp`, likewise.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub dynamics: DynamicsStage,
     /// Measuring success.
     pub evaluation: EvaluationConfig,
     /// How exact a GPU multiplies; without effect on the CPU. Checkpoints from before it have none.
@@ -307,6 +310,7 @@ impl RunConfig {
         t.easy_update_steps = mine.easy_update_steps;
         t.step.indicator_dropout = mine.step.indicator_dropout;
         same.recap = self.recap.clone();
+        same.dynamics = self.dynamics.clone();
         let (r, mine) = (&mut same.refine, &self.refine);
         r.kinematic_enabled = mine.kinematic_enabled;
         (r.gate, r.goal) = (mine.gate.clone(), mine.goal.clone());

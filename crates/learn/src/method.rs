@@ -12,7 +12,7 @@ use crate::run::Toolbox;
 use crate::{Demonstrations, Result, RunConfig, Trained};
 use e2h_core::{Direction, Episode};
 use e2h_data::Source;
-use e2h_policy::{Critic, CriticReport};
+use e2h_policy::{Critic, CriticReport, Dynamics, DynamicsReport};
 use e2h_refine::Refined;
 use std::sync::Arc;
 use std::time::Duration;
@@ -62,6 +62,14 @@ impl<'a> Tools<'a> {
     /// When the loss is not finite, or somebody asked the program to stop.
     pub fn critic(&self, round: &Round<'_>) -> Result<(Critic, CriticReport)> {
         self.run.critic(round)
+    }
+
+    /// Trains the round's dynamics models on hard rollouts, on features of the policy that collected them.
+    ///
+    /// # Errors
+    /// When the policy has no image encoders, the loss is not finite, or somebody asked the program to stop.
+    pub fn dynamics(&self, round: &Round<'_>) -> Result<(Dynamics, DynamicsReport)> {
+        self.run.dynamics(round)
     }
 
     /// Successful scripted demonstrations, recorded once a run.

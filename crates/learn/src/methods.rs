@@ -4,6 +4,7 @@ mod auto_e2h;
 mod direct_h;
 mod hard_demos;
 mod recap;
+mod tr_drl_dp;
 
 use crate::{Error, Method, Result};
 use std::sync::Arc;
@@ -13,6 +14,7 @@ pub use auto_e2h::{AutoE2h, candidates, filter};
 pub use direct_h::DirectH;
 pub use hard_demos::HardDemos;
 pub use recap::{Indicator, Recap, RecapConfig};
+pub use tr_drl_dp::{DynamicsStage, TrDrlDp};
 
 /// A method as it is chosen: code, and values laid over preset and task file.
 #[derive(Debug, Clone, Copy)]
@@ -35,11 +37,20 @@ pub const DEFAULT: &str = "auto-e2h";
 /// All that `--method` can name, the default first.
 #[must_use]
 pub fn registry() -> &'static [Entry] {
-    entries!["auto-e2h", "auto-e2h-literal", "no-kinematic", "no-critic", "direct-h", "hard-demos", "recap"]
+    entries![
+        "auto-e2h",
+        "auto-e2h-literal",
+        "no-kinematic",
+        "no-critic",
+        "direct-h",
+        "hard-demos",
+        "recap",
+        "tr-drl-dp"
+    ]
 }
 
 /// Names of the code that a method file can ask for.
-const CODE: [&str; 4] = ["auto-e2h", "direct-h", "hard-demos", "recap"];
+const CODE: [&str; 5] = ["auto-e2h", "direct-h", "hard-demos", "recap", "tr-drl-dp"];
 
 fn code(name: &str) -> Option<Arc<dyn Method>> {
     match name {
@@ -47,6 +58,7 @@ fn code(name: &str) -> Option<Arc<dyn Method>> {
         "direct-h" => Some(Arc::new(DirectH)),
         "hard-demos" => Some(Arc::new(HardDemos)),
         "recap" => Some(Arc::new(Recap)),
+        "tr-drl-dp" => Some(Arc::new(TrDrlDp)),
         _ => None,
     }
 }

@@ -161,6 +161,8 @@ const BASE: &[&str] = &[
 const EXPLORE: &str = "policies of no training never move the object; tests/explore.rs has one that does";
 
 const RECAP: &str = "of the method recap alone; tests/pipeline.rs has what it changes there";
+/// Of the method `tr-drl-dp` alone.
+const DYNAMICS: &str = "of the method tr-drl-dp alone; tests/pipeline.rs has what each changes there";
 
 const CHANGES: &[Change] = &[
     ("task.name", Err("each pair has its own program, and another name is refused")),
@@ -313,6 +315,15 @@ const CHANGES: &[Change] = &[
     ("critic.network.adam.clip_norm", Ok((Refine, "0.0001"))),
     ("recap.indicator", Err(RECAP)),
     ("recap.guidance", Err(RECAP)),
+    ("dynamics.gates", Err(DYNAMICS)),
+    ("dynamics.network.hidden", Err(DYNAMICS)),
+    ("dynamics.network.steps", Err(DYNAMICS)),
+    ("dynamics.network.batch", Err(DYNAMICS)),
+    ("dynamics.network.lr", Err(DYNAMICS)),
+    ("dynamics.network.validation", Err(DYNAMICS)),
+    ("dynamics.filter.smooth", Err(DYNAMICS)),
+    ("dynamics.filter.percentile", Err(DYNAMICS)),
+    ("dynamics.filter.min_run", Err(DYNAMICS)),
     ("evaluation.trials", Ok((Evaluate, "2"))),
     ("evaluation.seed", Ok((Evaluate, "7"))),
     ("evaluation.parallel", Err("how many trials the policy answers at once: changes last bits alone")),

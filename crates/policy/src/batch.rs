@@ -1,7 +1,7 @@
 //! Host-side assembly of what the network is fed: every number passes through here once.
 
 use crate::config::TOOL_FRAME;
-use crate::{ImageScaling, PolicyConfig, Result};
+use crate::{Error, ImageScaling, PolicyConfig, Result};
 use candle_core::{Device, Tensor};
 use e2h_core::state::{EEF_QUATERNION, OBJECT_QUATERNION, eef_position, object_position};
 use e2h_core::{Episode, Observation, Rng, State};
@@ -101,6 +101,28 @@ impl BatchBuilder {
         if let Some(scaling) = self.scaling.get(camera) {
             scaling.apply(&mut column[first..]);
         }
+    }
+
+    /// Appends the middle of the images of one row, one a camera.
+    ///
+    /// # Errors
+    /// When the episode lacks a camera's images in the size of the configuration, or they cannot be read.
+    pub(crate) fn push_frame(&mut self, c: &PolicyConfig, episode: &Episode, row: usize) -> Result<()> {
+        if c.n_image_steps == 0 {
+            return Ok(());
+        }
+        for (camera, name) in c.cameras.iter().enumerate() {
+            let named = episode.frames.iter().find(|f| f.camera == *name);
+            let frames = named.filter(|f| f.height == c.image_size).ok_or_else(|| {
+                Error::Data(format!(
+                    "expected images of {0} x {0} from camera {name}, found {1:?}",
+                    c.image_size,
+                    episode.frames.iter().map(|f| (&f.camera, f.height)).collect::<Vec<_>>()
+                ))
+            })?;
+            self.push_image(camera, &frames.image(row)?, c.centre_crop(), c.crop_size, None);
+        }
+        Ok(())
     }
 
     /// State (B, To * S) and one (B * steps, crop, crop, 3) tensor a camera, on `device`.

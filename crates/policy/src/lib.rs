@@ -28,6 +28,7 @@ mod config;
 mod critic;
 mod critic_file;
 mod ddim;
+mod dynamics;
 mod error;
 mod folder;
 pub mod lerobot;
@@ -41,6 +42,7 @@ pub use config::{EncoderNorm, ImageScaling, PolicyConfig, Prediction, SamplerKin
 pub use critic::{Critic, CriticReport, CriticTraining, train_critic};
 pub use critic_file::{CRITIC_FORMAT, CriticProvenance};
 pub use ddim::{Ddim, DdimStep};
+pub use dynamics::{Dynamics, DynamicsConfig, DynamicsReport, DynamicsTraining, train_dynamics};
 pub use error::{Error, Result};
 pub use model::DiffusionModel;
 pub use policy::DiffusionPolicy;

@@ -128,6 +128,10 @@ pub struct Refined {
     pub advantage: Option<Vec<f32>>,
     /// Advantage below which frames were marked for removal.
     pub threshold: Option<f32>,
+    /// Smoothed error of a dynamics model at every input frame, where one was asked.
+    pub dynamics_error: Option<Vec<f32>>,
+    /// Error above which frames were removed.
+    pub dynamics_threshold: Option<f32>,
 }
 
 impl Refined {
@@ -144,7 +148,17 @@ impl Refined {
             segment.origin.kind = Kind::Refined;
         }
         let report = RefineReport::new(&fates, segments.len());
-        Self { segments, fates, report, speed, value: None, advantage: None, threshold: None }
+        Self {
+            segments,
+            fates,
+            report,
+            speed,
+            value: None,
+            advantage: None,
+            threshold: None,
+            dynamics_error: None,
+            dynamics_threshold: None,
+        }
     }
 
     /// This stage followed by another: `later[i]` is what the later stage made of `segments[i]`. Fates, values and
@@ -156,9 +170,12 @@ impl Refined {
         let fates = merge_fates(&self, &later)?;
         let value = self.scatter(&later, |r| r.value.as_ref());
         let advantage = self.scatter(&later, |r| r.advantage.as_ref());
+        let dynamics_error = self.scatter(&later, |r| r.dynamics_error.as_ref());
         let threshold = later.iter().find_map(|r| r.threshold).or(self.threshold);
+        let dynamics_threshold = later.iter().find_map(|r| r.dynamics_threshold).or(self.dynamics_threshold);
         let segments = later.into_iter().flat_map(|r| r.segments).collect();
-        Ok(Self { value, advantage, threshold, ..Self::new(segments, fates, self.speed) })
+        let new = Self::new(segments, fates, self.speed);
+        Ok(Self { value, advantage, threshold, dynamics_error, dynamics_threshold, ..new })
     }
 
     /// A column of the later stage, brought to the frames of this one.

@@ -25,6 +25,7 @@
 
 mod advantage;
 mod compose;
+mod dynamics;
 mod error;
 mod fate;
 #[cfg(test)]
@@ -44,6 +45,7 @@ mod suffix;
 
 pub use advantage::{AdvantageConfig, advantage_filter, advantages};
 pub use compose::critic_filter;
+pub use dynamics::{DynamicsFilterConfig, dynamics_filter};
 pub use error::{Error, Result};
 pub use fate::{Fate, RefineReport, Refined, merge_fates};
 pub use goal::{Goal, GoalConfig};

@@ -192,6 +192,9 @@ pub struct Reversal {
     pub value: Option<Vec<Option<f32>>>,
     /// Smoothed advantage, likewise.
     pub advantage: Option<Vec<Option<f32>>>,
+    /// Smoothed error of a dynamics model, where one judged; none in records from before there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dynamics_error: Option<Vec<Option<f32>>>,
     /// How far exploration had displaced the goal, mm; none where it had not, and in records from before there was any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub excursion: Option<Vec<f32>>,
@@ -212,6 +215,7 @@ impl Reversal {
             fates: refined.fates.clone(),
             speed: refined.speed.clone(),
             excursion: crate::picture::excursions(reversed),
+            dynamics_error: refined.dynamics_error.as_ref().map(finite),
             value: refined.value.as_ref().map(finite),
             advantage: refined.advantage.as_ref().map(finite),
             threshold: refined.threshold.filter(|t| t.is_finite()),

@@ -115,6 +115,8 @@ impl RunConfig {
         all.check(guidance == 1.0 || t.step.indicator_dropout > 0.0, || {
             format!("recap.guidance: expected 1 with train.step.indicator_dropout = 0, got {guidance}")
         });
+        all.of("dynamics.network", self.dynamics.network.validate());
+        all.of("dynamics.filter", self.dynamics.filter.validate());
         all.of("critic.network", self.critic.network.validate(p));
         for camera in p.cameras.iter().filter(|c| !CAMERAS.contains(&c.as_str())) {
             all.0.push(format!(

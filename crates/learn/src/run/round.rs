@@ -9,7 +9,10 @@ use crate::policy_class::Trained;
 use crate::record::{Collection, Reversal};
 use crate::{Error, Result};
 use e2h_core::{Direction, Episode, ImageStore, Policy};
-use e2h_policy::{Critic, CriticReport, CriticTraining, train_critic};
+use e2h_policy::{
+    Critic, CriticReport, CriticTraining, Dynamics, DynamicsReport, DynamicsTraining, train_critic,
+    train_dynamics,
+};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
 use std::sync::Arc;
@@ -30,6 +33,7 @@ pub struct Accepted {
 /// What [`Tools`] of a method call.
 pub(crate) trait Toolbox {
     fn critic(&self, round: &Round<'_>) -> Result<(Critic, CriticReport)>;
+    fn dynamics(&self, round: &Round<'_>) -> Result<(Dynamics, DynamicsReport)>;
     fn demonstrate(&self, direction: Direction) -> Result<Vec<Episode>>;
 }
 
@@ -80,6 +84,21 @@ impl Run {
             self.dir.put_episodes(&place, &all, &collected.resets)?;
         }
         Ok(collected)
+    }
+
+    /// Whether a training in a round goes on.
+    fn flow(&self) -> ControlFlow<()> {
+        if self.progress.check().is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    }
+
+    /// A training that [`Run::flow`] broke off was stopped by what asked for it.
+    fn unless_stopped<T>(&self, trained: e2h_policy::Result<T>) -> Result<T> {
+        match trained {
+            Err(e2h_policy::Error::Stopped { .. }) => {
+                Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }))
+            }
+            done => Ok(done?),
+        }
     }
 
     /// Pictures and record of a round.
@@ -150,16 +169,10 @@ impl Toolbox for Run {
             seed: self.options.seed,
             purpose: &format!("critic/{iteration}"),
         };
-        let trained = train_critic(&training, |step, loss| {
+        let (critic, report) = self.unless_stopped(train_critic(&training, |step, loss| {
             bar.set(step as u64, &format!("loss {loss:.4}"));
-            if self.progress.check().is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-        });
-        let (critic, report) = match trained {
-            Err(e2h_policy::Error::Stopped { .. }) => {
-                return Err(self.progress.check().err().unwrap_or(Error::Stopped { signal: 0 }));
-            }
-            done => done?,
-        };
+            self.flow()
+        }))?;
         let held_out = report.validation_loss.unwrap_or(f64::NAN);
         bar.finish(&format!("loss {:.4}, held out {held_out:.4}", report.train_loss));
         if let Some(mut events) = self.events(&format!("critic_{iteration:02}"), 0)? {
@@ -169,6 +182,33 @@ impl Toolbox for Run {
             events.finish()?;
         }
         Ok((critic, report))
+    }
+
+    fn dynamics(&self, round: &Round<'_>) -> Result<(Dynamics, DynamicsReport)> {
+        let (c, iteration) = (self.config(), round.iteration);
+        let network = &c.dynamics.network;
+        let bar = self.progress.bar(&format!("dynamics {iteration}"), 2 * network.steps as u64);
+        let training = DynamicsTraining {
+            policy: &c.policy,
+            policy_weights: &round.policy.weights()?,
+            dynamics: network,
+            compute: &self.compute,
+            normaliser: &round.demonstrations.normaliser,
+            rollouts: &round.rollouts.hard,
+            seed: self.options.seed,
+            purpose: &format!("dynamics/{iteration}"),
+        };
+        let (dynamics, report) = self.unless_stopped(train_dynamics(&training, |step, loss| {
+            bar.set(step as u64, &format!("loss {loss:.4}"));
+            self.flow()
+        }))?;
+        let held_out = |v: Option<f64>| v.unwrap_or(f64::NAN);
+        bar.finish(&format!(
+            "held out: forward {:.4}, inverse {:.4}",
+            held_out(report.forward_held_out),
+            held_out(report.inverse_held_out)
+        ));
+        Ok((dynamics, report))
     }
 
     fn demonstrate(&self, direction: Direction) -> Result<Vec<Episode>> {

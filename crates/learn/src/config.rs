@@ -236,33 +236,23 @@ impl RunConfig {
     ) -> Result<Resolved> {
         let mut table = parse(preset, find("preset", preset, &PRESETS)?)?;
         let of_task = parse(task, own.map_or_else(|| of_registry(task), Ok)?)?;
-        // A task file has entries for all presets, and may have some for one alone.
-        let mut common = of_task.clone();
-        let special = common.remove("preset");
+        let overrides = overrides.iter().map(|text| layer(text)).collect::<Result<Vec<Table>>>()?;
+        // A task file has entries for all presets, may have some for one alone, and some for one variant in one preset.
+        let mut common = of_task;
+        let (of_preset, of_variant) = (common.remove("preset"), common.remove("variant"));
+        let of_preset = inner(of_preset.as_ref(), preset);
         merge(&mut table, &common, "")?;
-        if let Some(Value::Table(special)) = special
-            && let Some(Value::Table(special)) = special.get(preset)
-        {
+        if let Some(special) = of_preset {
+            merge(&mut table, special, "")?;
+        }
+        let variant = |layer: &Table| layer.get("task")?.get("variant")?.as_str().map(str::to_owned);
+        let chosen = overrides.iter().rev().find_map(variant).or_else(|| variant(&table)).unwrap_or_default();
+        if let Some(special) = inner(of_variant.as_ref(), &chosen).and_then(|v| v.get(preset)?.as_table()) {
             merge(&mut table, special, "")?;
         }
         merge(&mut table, method, "")?;
-        for text in overrides {
-            let (key, value) = text
-                .split_once('=')
-                .ok_or_else(|| Error::Config(format!("--set: expected key=value, got `{text}`")))?;
-            let mut layer = Value::String(value.trim().to_owned());
-            // What is not TOML is taken as a plain string, so that quotes are not needed on the command line.
-            if let Ok(parsed) = format!("v = {value}").parse::<Table>()
-                && let Some(v) = parsed.get("v")
-            {
-                layer = v.clone();
-            }
-            for part in key.trim().split('.').rev() {
-                layer = Value::Table(Table::from_iter([(part.to_owned(), layer)]));
-            }
-            if let Value::Table(layer) = layer {
-                merge(&mut table, &layer, "")?;
-            }
+        for layer in &overrides {
+            merge(&mut table, layer, "")?;
         }
         let found = table.get("task").and_then(|t| t.get("name")).and_then(Value::as_str).unwrap_or_default();
         if found != task {
@@ -366,6 +356,32 @@ fn parse(name: &str, text: &str) -> Result<Table> {
 /// Keys of earlier versions, and what says it now.
 const MOVED: [(&str, &str); 1] = [("train.step.adam.lr", "train.step.schedule.lr")];
 
+/// A table inside a table, if there is one.
+fn inner<'a>(table: Option<&'a Value>, key: &str) -> Option<&'a Table> {
+    table?.get(key)?.as_table()
+}
+
+/// The layer that one `key.path=value` lays over a configuration.
+fn layer(text: &str) -> Result<Table> {
+    let (key, value) = text
+        .split_once('=')
+        .ok_or_else(|| Error::Config(format!("--set: expected key=value, got `{text}`")))?;
+    let mut layer = Value::String(value.trim().to_owned());
+    // What is not TOML is taken as a plain string, so that quotes are not needed on the command line.
+    if let Ok(parsed) = format!("v = {value}").parse::<Table>()
+        && let Some(v) = parsed.get("v")
+    {
+        layer = v.clone();
+    }
+    let mut path: Vec<&str> = key.trim().split('.').collect();
+    let last = path.pop().unwrap_or_default();
+    let mut table = Table::from_iter([(last.to_owned(), layer)]);
+    for part in path.into_iter().rev() {
+        table = Table::from_iter([(part.to_owned(), Value::Table(table))]);
+    }
+    Ok(table)
+}
+
 /// Lays `over` onto `base`; a key that `base` does not have is unknown, because presets state every entry.
 fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
     for (key, value) in over {
@@ -431,6 +447,19 @@ mod tests {
             let config = RunConfig::resolve("paper", name, &[]).unwrap().config;
             let task = e2h_env::task(name, &config.task.options()).unwrap();
             assert_eq!(config.refine.suffix.enabled, !task.homes(), "{name}");
+            // Names in a task file are names of presets and variants, or nobody would ever see its values.
+            let file = parse(name, of_registry(name).unwrap()).unwrap();
+            let tables = |v: Option<&Value>| v.and_then(Value::as_table).cloned().unwrap_or_default();
+            let mut presets: Vec<String> = tables(file.get("preset")).keys().cloned().collect();
+            for (variant, values) in tables(file.get("variant")) {
+                for preset in tables(Some(&values)).keys() {
+                    let set = [format!("task.variant={variant}")];
+                    let config = RunConfig::resolve(preset, name, &set).unwrap().config;
+                    e2h_env::task(name, &config.task.options()).unwrap();
+                    presets.push(preset.clone());
+                }
+            }
+            assert!(presets.iter().all(|p| PRESETS.iter().any(|(n, _)| n == p)), "{name}: {presets:?}");
         }
     }
 
@@ -445,6 +474,23 @@ mod tests {
         assert_eq!(r.closed_loop.cycles, 7);
         assert!((r.train.step.schedule.lr - 1.0).abs() < 1e-9);
         assert_eq!(r.task.variant, "square");
+    }
+
+    #[test]
+    fn a_variant_has_values_of_its_own_in_a_preset_and_overrides_win_over_them() {
+        let resolve = |preset: &str, set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).to_owned()).collect();
+            RunConfig::resolve(preset, "nut_assembly", &set).unwrap().config
+        };
+        let (loose, square) = (resolve("laptop", &[]), resolve("laptop", &["task.variant=square"]));
+        assert!(!loose.closed_loop.explore.enabled && square.closed_loop.explore.enabled);
+        assert_eq!((square.closed_loop.cycles, square.train.update_from), (300, UpdateFrom::Scratch));
+        // In whatever order they are given.
+        let few = resolve("laptop", &["loop.cycles=7", "task.variant=square"]);
+        assert_eq!((few.closed_loop.cycles, few.train.easy_steps), (7, square.train.easy_steps));
+        let last = resolve("laptop", &["task.variant=square", "task.variant=loose"]);
+        assert_eq!(last, loose);
+        assert_eq!(resolve("smoke", &["task.variant=square"]).train, resolve("smoke", &[]).train);
     }
 
     #[test]

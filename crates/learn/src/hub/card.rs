@@ -143,11 +143,18 @@ pub fn command(provenance: &Provenance) -> String {
         plain(&p.preset),
         p.seed
     );
-    let standard =
-        RunConfig::resolve(&p.preset, &p.task, &[]).ok().and_then(|r| Table::try_from(r.config).ok());
-    let this = serde_json::from_value::<RunConfig>(p.run.clone()).ok().and_then(|c| Table::try_from(c).ok());
-    if let (Some(standard), Some(this)) = (standard, this) {
+    let standard = |set: &[String]| RunConfig::resolve(&p.preset, &p.task, set).ok().map(|r| r.config);
+    let this = serde_json::from_value::<RunConfig>(p.run.clone()).ok();
+    if let (Some(standard_one), Some(this)) = (standard(&[]), this) {
+        // A variant may bring values of its own.
         let mut set = vec![];
+        if this.task.variant != standard_one.task.variant {
+            set.push(format!("task.variant={}", Value::String(this.task.variant.clone())));
+        }
+        let standard = standard(&set).unwrap_or(standard_one);
+        let (Ok(standard), Ok(this)) = (Table::try_from(standard), Table::try_from(this)) else {
+            return command;
+        };
         differences(&standard, &this, "", &mut set);
         for text in set {
             // Quotes of the shell, which a quote in the value ends and opens again.

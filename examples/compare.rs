@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example compare -- --tasks cube_pick_place --methods auto-e2h,direct-h --seeds 0,1 --out runs/compare
+//! cargo run --release --example compare -- --tasks cube_pick_place --preset smoke --seeds 0 --trials 10 --out runs/compare_smoke
 //! ```
 //!
 //! The same command goes on where it was stopped. `--shard i/n` does a part of the runs, for several machines that share a folder or

@@ -57,8 +57,12 @@ fn words_that_cannot_be_written_stop_nothing() {
 
 /// Every program that prints, with little to do. NEW is a folder of its own; RUN, SET and OURS are a finished run, recordings and a
 /// checkpoint that LeRobot can have.
-const PROGRAMS: [(&str, &str); 15] = [
+const PROGRAMS: [(&str, &str); 16] = [
     ("nut_assembly", "--preset smoke --quiet --resume --out RUN SMALL"),
+    (
+        "compare",
+        "--tasks disk --methods hard-demos --seeds 0 --preset smoke --trials 1 --quiet --out NEW/compare",
+    ),
     ("curve", "RUN --out NEW/curve.svg"),
     ("dataset", "check SET"),
     ("env_step", "--task disk --px 16 --steps 5"),

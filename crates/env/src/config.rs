@@ -99,6 +99,8 @@ impl EnvConfig {
         // A success that has to be held for longer than an episode lasts is none.
         let shortest = self.horizon_hard.min(self.horizon_easy).max(1);
         whole(&mut problems, "hold_steps", self.hold_steps, [1, shortest]);
+        // A policy that thinks as long as an episode lasts does nothing in it.
+        whole(&mut problems, "latency", self.latency, [0, shortest - 1]);
         for (name, value, bounds) in [
             ("max_goal_step_m", self.max_goal_step_m, [1e-4, 1.0]),
             ("max_goal_step_rad", self.max_goal_step_rad, [1e-4, std::f64::consts::PI]),

@@ -308,10 +308,11 @@ impl Episode {
     /// Moves the images to `store`: from here on they take no memory, and reading them takes a moment.
     ///
     /// # Errors
-    /// When an image cannot be read or written; those before it have moved, and all are there.
+    /// When an image cannot be read or written; all stay where they were.
     pub fn store_images(&mut self, store: &ImageStore) -> Result<()> {
-        for image in self.frames.iter_mut().flat_map(|f| &mut f.images) {
-            *image = image.stored(store)?;
+        let stored = store.take(self.frames.iter().flat_map(|f| &f.images))?;
+        for (image, stored) in self.frames.iter_mut().flat_map(|f| &mut f.images).zip(stored) {
+            *image = stored;
         }
         Ok(())
     }

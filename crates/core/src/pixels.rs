@@ -32,19 +32,35 @@ impl ImageStore {
         Ok(Self(Arc::new(Inner { folder: folder.to_owned(), file: Mutex::new((file, 0)) })))
     }
 
-    /// Writes one image.
+    /// The same images here, written in one go; those that lie here already are not written again.
     ///
     /// # Errors
-    /// When it cannot be written, for want of space for instance; the store stays as it was.
-    pub fn put(&self, bytes: &[u8]) -> Result<Pixels> {
+    /// When one cannot be read, or they cannot be written, for want of space for instance; the store stays as it was.
+    pub fn take<'a>(&self, images: impl IntoIterator<Item = &'a Pixels>) -> Result<Vec<Pixels>> {
+        let here = |p: &Pixels| matches!(&p.0, Place::Stored { store, .. } if Arc::ptr_eq(&store.0, &self.0));
+        // Read before this store is locked: two stores may take from each other.
+        let images: Vec<&Pixels> = images.into_iter().collect();
+        let mut bytes = vec![];
+        for image in images.iter().filter(|p| !here(p)) {
+            bytes.extend_from_slice(&image.read()?);
+        }
         let mut guard = self.0.file.lock().unwrap_or_else(PoisonError::into_inner);
         let (file, end) = &mut *guard;
-        let at = *end;
-        file.seek(SeekFrom::Start(at))
-            .and_then(|_| file.write_all(bytes))
+        let mut next = *end;
+        let mut place = |image: &Pixels| {
+            if here(image) {
+                return image.clone();
+            }
+            let (at, len) = (next, image.len());
+            next += len as u64;
+            Pixels(Place::Stored { store: self.clone(), at, len })
+        };
+        let taken = images.into_iter().map(&mut place).collect();
+        file.seek(SeekFrom::Start(*end))
+            .and_then(|_| file.write_all(&bytes))
             .map_err(|e| self.error("writing", e))?;
         *end += bytes.len() as u64;
-        Ok(Pixels(Place::Stored { store: self.clone(), at, len: bytes.len() }))
+        Ok(taken)
     }
 
     /// Bytes of all images that were written.
@@ -93,17 +109,6 @@ impl Pixels {
         match &self.0 {
             Place::Memory(bytes) => Ok(Cow::Borrowed(bytes)),
             Place::Stored { store, at, len } => store.get(*at, *len).map(Cow::Owned),
-        }
-    }
-
-    /// The same image in `store`; this one where it lies there already.
-    ///
-    /// # Errors
-    /// When it cannot be read or written.
-    pub fn stored(&self, store: &ImageStore) -> Result<Self> {
-        match &self.0 {
-            Place::Stored { store: here, .. } if Arc::ptr_eq(&here.0, &store.0) => Ok(self.clone()),
-            _ => store.put(&self.read()?),
         }
     }
 
@@ -163,14 +168,14 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let store = ImageStore::create(folder.path()).unwrap();
         let memory: Vec<Pixels> = (0u8..5).map(|n| vec![n; 7 + usize::from(n)].into()).collect();
-        let stored: Vec<Pixels> = memory.iter().map(|p| p.stored(&store).unwrap()).collect();
+        let stored = store.take(&memory).unwrap();
         assert_eq!(store.bytes(), 45);
         assert!(stored.iter().all(|p| !p.in_memory()) && memory.iter().all(Pixels::in_memory));
-        let again = stored[3].stored(&store).unwrap();
-        assert_eq!(store.bytes(), 45, "what lies there is not written twice");
+        let again = store.take([&stored[3], &memory[1]]).unwrap();
+        assert_eq!(store.bytes(), 45 + 8, "what lies there is not written twice");
         drop(store);
         assert_eq!(stored, memory);
-        assert_eq!(*again.read().unwrap(), [3; 10]);
+        assert_eq!((&*again[0].read().unwrap(), &*again[1].read().unwrap()), (&[3; 10][..], &[1; 8][..]));
         assert_ne!(stored[0], memory[1]);
         let left: Vec<_> = std::fs::read_dir(folder.path()).unwrap().collect();
         assert!(left.is_empty(), "the file has no name: {left:?}");
@@ -180,10 +185,10 @@ mod tests {
     fn images_move_from_one_store_to_another() {
         let folder = tempfile::tempdir().unwrap();
         let [a, b] = [0; 2].map(|_| ImageStore::create(folder.path()).unwrap());
-        a.put(&[9; 4]).unwrap();
-        let there = a.put(&[1, 2, 3]).unwrap().stored(&b).unwrap();
+        let there = a.take(&[vec![9; 4].into(), vec![1, 2, 3].into()]).unwrap();
+        let there = b.take(&there[1..]).unwrap();
         drop(a);
-        assert_eq!((b.bytes(), &*there.read().unwrap()), (3, &[1u8, 2, 3][..]));
+        assert_eq!((b.bytes(), &*there[0].read().unwrap()), (3, &[1u8, 2, 3][..]));
     }
 
     #[test]

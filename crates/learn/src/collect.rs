@@ -22,6 +22,8 @@ pub struct Collected {
     pub easy_rollouts: usize,
     /// Easy rollouts that succeeded.
     pub easy_successes: usize,
+    /// Control steps of all rollouts.
+    pub steps: usize,
     /// External resets by cause.
     pub resets: BTreeMap<ResetCause, usize>,
     /// Cycles with exploration.
@@ -117,6 +119,7 @@ pub fn collect(
         if let Some(store) = images {
             episode.store_images(store)?;
         }
+        lane.state.collected.steps += finished.steps;
         let success = finished.outcome.is_success();
         // What only an external reset repairs.
         let accident = match finished.outcome {
@@ -222,6 +225,7 @@ pub fn collect(
         all.rejected.extend(c.rejected);
         all.easy_rollouts += c.easy_rollouts;
         all.easy_successes += c.easy_successes;
+        all.steps += c.steps;
         all.explored += c.explored;
         all.plain += c.plain;
         for (cause, n) in c.resets {

@@ -33,6 +33,9 @@ pub use round::Accepted;
 pub(crate) use round::Toolbox;
 pub use stage::{Json, Stored};
 
+/// Where demonstrations of the hard direction lie, for methods that ask for them.
+const HARD_DEMONSTRATIONS: &str = "demonstrations_hard";
+
 /// A run in progress.
 pub struct Run {
     options: RunOptions,
@@ -232,7 +235,7 @@ impl Run {
         let c = self.config();
         let (place, purpose) = match direction {
             Direction::Easy => ("demonstrations", "demonstrate"),
-            Direction::Hard => ("demonstrations_hard", "demonstrate/hard"),
+            Direction::Hard => (HARD_DEMONSTRATIONS, "demonstrate/hard"),
         };
         self.stage(place, || {
             let wanted = c.closed_loop.demonstrations;

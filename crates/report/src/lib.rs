@@ -18,6 +18,7 @@
 //!     collection: None,
 //!     loss: 0.01,
 //!     skipped: false,
+//!     updates: 1500,
 //! };
 //! let results = RunResults {
 //!     task: "nut_assembly".to_owned(),

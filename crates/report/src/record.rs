@@ -66,6 +66,9 @@ pub struct IterationRecord {
     pub loss: f64,
     /// True when nothing was accepted and the update was skipped.
     pub skipped: bool,
+    /// Training steps of the hard policy in this iteration; 0 in records from before they were counted.
+    #[serde(default)]
+    pub updates: usize,
 }
 
 /// What one round of closed-loop collection brought and what refinement made of it.
@@ -79,6 +82,9 @@ pub struct Collection {
     pub easy_successes: usize,
     /// Easy rollouts started.
     pub easy_rollouts: usize,
+    /// Control steps of all rollouts of both directions; 0 in records from before they were counted.
+    #[serde(default)]
+    pub steps: usize,
     /// External resets by cause.
     pub resets: BTreeMap<ResetCause, usize>,
     /// Cycles whose easy rollout explored; none in records from before there was exploration.
@@ -254,6 +260,9 @@ pub struct RunResults {
     pub iterations: Vec<IterationRecord>,
     /// Mean control steps of a scripted demonstration, easy direction (the paper's cost table).
     pub demonstration_steps: f64,
+    /// The same of the hard direction, in runs that begin with such demonstrations; none in others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hard_demonstration_steps: Option<f64>,
 }
 
 /// The runs of a `results.json`: the one of a run directory, or several under `runs` beside a published policy.

@@ -33,6 +33,7 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
                 hard_successes: 8 + 5 * n,
                 easy_successes: 33 + n / 2,
                 easy_rollouts: 40,
+                steps: 12_000,
                 resets: [
                     (ResetCause::Start, 8),
                     (ResetCause::HardFailed, 12 - n),
@@ -58,6 +59,7 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
             }),
             loss: 0.04 / (1.0 + 0.6 * f64::from(i)),
             skipped: false,
+            updates: 1500,
         }
     };
     RunResults {
@@ -73,6 +75,7 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
         machine: "2 threads, some processor".to_owned(),
         iterations: (0..iterations).map(row).collect(),
         demonstration_steps: 171.0,
+        hard_demonstration_steps: None,
     }
 }
 

@@ -159,6 +159,7 @@ fn run(dir: &Path) -> Vec<Episode> {
             cycles: 2,
             hard_successes: 1,
             easy_rollouts: 2,
+            steps: 400,
             easy_successes: 1,
             accepted: 1,
             fates: [(Fate::Kept, kept), (Fate::Static, 90 - kept)].into(),
@@ -168,6 +169,7 @@ fn run(dir: &Path) -> Vec<Episode> {
         }),
         loss: 0.5,
         skipped: false,
+        updates: 1500,
     };
     put("iteration_01/record.json", serde_json::to_string(&record).unwrap());
     refined.segments

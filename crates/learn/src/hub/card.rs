@@ -211,6 +211,7 @@ mod tests {
             collection: None,
             loss: 0.04,
             skipped: false,
+            updates: 1500,
         };
         RunResults {
             task: "nut_assembly".to_owned(),

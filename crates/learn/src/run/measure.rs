@@ -1,7 +1,7 @@
 //! What a run says of itself: one row of the record an iteration, and the report at the end.
 
 use super::stage::TrainNotes;
-use super::{Accepted, Demonstrations, Run, folder, now};
+use super::{Accepted, Demonstrations, HARD_DEMONSTRATIONS, Run, folder, now};
 use crate::Result;
 use crate::evaluate::{Filmed, Filming, evaluate};
 use crate::picture;
@@ -46,7 +46,7 @@ impl Run {
         let envs = self.envs(e.parallel.min(e.trials))?;
         let filming = Filming { trials: Filmed::First(e.filmed), camera: "table".to_owned(), size: 160 };
         let filming = (e.filmed > 0).then_some(&filming);
-        let done = evaluate(envs, policy, Direction::Hard, e.trials, e.seed, filming, &self.progress)?;
+        let done = evaluate(envs, policy, Direction::Hard, 0..e.trials, e.seed, filming, &self.progress)?;
         let evaluation = done.evaluation;
         if !done.films.is_empty() {
             let path = self.dir.join(folder(iteration, "rollouts.png"));
@@ -78,8 +78,9 @@ impl Run {
             minutes: before + stage_minutes.values().sum::<f64>(),
             stage_minutes,
             collection: accepted.map(|a| a.collection.clone()),
-            loss: trained.map_or(0.0, |t| t.loss),
+            loss: trained.as_ref().map_or(0.0, |t| t.loss),
             skipped: accepted.is_some_and(|a| a.segments.is_empty()),
+            updates: trained.as_ref().map_or(0, |t| t.steps),
         };
         let files = self.dir.seals(&[folder(iteration, "rollouts.png")])?;
         let measured = Measured { record, files };
@@ -112,7 +113,11 @@ impl Run {
     ) -> Result<(RunResults, PathBuf)> {
         let c = self.config();
         let easy = &demonstrations.easy;
-        let steps: usize = easy.iter().map(Episode::len).sum();
+        let mean_steps = |episodes: &[Episode]| {
+            episodes.iter().map(Episode::len).sum::<usize>() as f64 / episodes.len().max(1) as f64
+        };
+        let recorded = self.dir.join(HARD_DEMONSTRATIONS).exists();
+        let hard = recorded.then(|| self.demonstrate(Direction::Hard)).transpose()?;
         let results = RunResults {
             task: self.options.task.clone(),
             variant: c.task.variant.clone(),
@@ -125,7 +130,8 @@ impl Run {
             overrides: self.options.set.clone(),
             machine: machine(self.compute.name()),
             iterations: records,
-            demonstration_steps: steps as f64 / easy.len().max(1) as f64,
+            demonstration_steps: mean_steps(easy),
+            hard_demonstration_steps: hard.as_deref().map(mean_steps),
         };
         self.dir.put("results.json", &results)?;
         let mut pictures = report::Pictures::default();

@@ -139,6 +139,7 @@ impl Run {
             hard_successes,
             easy_successes: rollouts.easy_successes,
             easy_rollouts: rollouts.easy_rollouts,
+            steps: rollouts.steps,
             resets: rollouts.resets,
             explored: rollouts.explored,
             plain: rollouts.plain,

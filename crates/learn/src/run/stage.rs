@@ -141,6 +141,9 @@ impl Stored for Accepted {
 pub(super) struct TrainNotes {
     pub(super) minutes: f64,
     pub(super) loss: f64,
+    /// Steps; runs of version 0.1 have none.
+    #[serde(default)]
+    pub(super) steps: usize,
     /// SHA-256 of the policy's files. Runs of version 0.1 have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     files: Option<BTreeMap<String, String>>,
@@ -153,6 +156,7 @@ pub(super) struct TrainNotes {
 pub(super) struct PolicyStage {
     pub(super) policy: Box<dyn Trained>,
     pub(super) loss: f64,
+    pub(super) steps: usize,
     pub(super) provenance: Provenance,
 }
 
@@ -164,7 +168,7 @@ impl Stored for PolicyStage {
         }
         run.dir.verify(&format!("{place}/policy.json"), notes.policy_sha256.as_deref())?;
         let policy = run.class.load(&run.dir.join(place), &run.compute)?;
-        Ok(Some(Self { policy, loss: notes.loss, provenance: Provenance::default() }))
+        Ok(Some(Self { policy, loss: notes.loss, steps: notes.steps, provenance: Provenance::default() }))
     }
 
     fn write(&self, run: &Run, place: &str, minutes: f64) -> Result<()> {
@@ -173,7 +177,13 @@ impl Stored for PolicyStage {
         let mut files = BTreeMap::new();
         run.dir.sums(place, "", &mut files)?;
         files.retain(|file, _| ![TRAINING, SPENT].contains(&file.as_str()) && !file.starts_with('.'));
-        let notes = TrainNotes { minutes, loss: self.loss, files: Some(files), policy_sha256: None };
+        let notes = TrainNotes {
+            minutes,
+            loss: self.loss,
+            steps: self.steps,
+            files: Some(files),
+            policy_sha256: None,
+        };
         run.dir.put_sealed(&format!("{place}/notes.json"), &notes)?;
         for file in [TRAINING, SPENT].map(|file| folder.join(file)).iter().filter(|f| f.exists()) {
             std::fs::remove_file(file).map_err(|source| Error::Io {

@@ -181,7 +181,7 @@ impl Run {
             events.map(Events::finish).transpose()?;
             let loss = training.mean_loss();
             bar.finish(&format!("{steps} steps, loss {loss:.4}"));
-            Ok(PolicyStage { policy: training.policy()?, loss, provenance })
+            Ok(PolicyStage { policy: training.policy()?, loss, steps, provenance })
         })?;
         Ok(done.policy)
     }

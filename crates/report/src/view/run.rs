@@ -175,6 +175,7 @@ impl RunSource {
             machine: String::new(),
             iterations: self.records.clone(),
             demonstration_steps: 0.0,
+            hard_demonstration_steps: None,
         })
     }
 

@@ -6,7 +6,8 @@
 //! ```
 //!
 //! The same command goes on where it was stopped. `--shard i/n` does a part of the runs, for several machines that share a folder or
-//! have it copied together; `--merge` only writes the page of the runs that are there.
+//! have it copied together; `--merge` only writes the page of the runs that are there. `--until-decided` goes on with the trials of last
+//! policies that no test has told apart yet, up to 500 of each.
 
 use anyhow::{Context as _, bail, ensure};
 use auto_e2h::core::{Direction, mention, say};
@@ -17,6 +18,7 @@ use auto_e2h::report::record::Evaluation;
 use clap::Parser;
 use std::collections::VecDeque;
 use std::fs::File;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
 use std::time::Duration;
@@ -49,6 +51,9 @@ struct Arguments {
     /// Trials of each first and last policy.
     #[arg(long, default_value_t = 200)]
     trials: usize,
+    /// Add trials of last policies until a test tells them from the reference's, at most so many; verdicts are then by E-values.
+    #[arg(long, value_name = "MOST", num_args = 0..=1, default_missing_value = "500", conflicts_with = "shard")]
+    until_decided: Option<usize>,
     /// Seed of these trials; no choice should have been made on it.
     #[arg(long, default_value_t = 800_000)]
     evaluation_seed: u64,
@@ -123,10 +128,10 @@ fn main() -> ExitCode {
 }
 
 fn program() -> anyhow::Result<ExitCode> {
-    let a = Arguments::parse();
+    let mut a = Arguments::parse();
     let stop = Stop::on_signals()?;
     let jobs = check(&a)?;
-    plan(&a)?;
+    plan(&mut a)?;
     if let Some(name) = &a.only {
         let job = jobs.iter().find(|j| j.name() == *name);
         let job = job.with_context(|| {
@@ -136,6 +141,9 @@ fn program() -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let failed = if a.merge { 0 } else { work(&a, &jobs, &stop)? };
+    if a.shard.is_none() {
+        decide(&a, &jobs, &stop)?;
+    }
     finish(&a, &jobs)?;
     Ok(if failed == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -150,6 +158,13 @@ fn check(a: &Arguments) -> anyhow::Result<Vec<Job>> {
     ensure!(!twice(&a.methods), "--methods: one is named twice");
     ensure!(!twice(&a.seeds), "--seeds: one is named twice");
     ensure!((1..=100_000).contains(&a.trials), "--trials: expected 1 to 100000, got {}", a.trials);
+    if let Some(most) = a.until_decided {
+        ensure!(
+            (a.trials..=100_000).contains(&most),
+            "--until-decided: expected from --trials ({}) to 100000, got {most}",
+            a.trials
+        );
+    }
     ensure!(a.jobs != Some(0), "--jobs: expected at least 1, got 0");
     let mut jobs = vec![];
     for method in &a.methods {
@@ -165,23 +180,38 @@ fn check(a: &Arguments) -> anyhow::Result<Vec<Job>> {
     Ok(jobs)
 }
 
-/// Writes the plan of a new folder, and refuses a folder of another one.
-fn plan(a: &Arguments) -> anyhow::Result<()> {
+/// Writes the plan of a new folder, and refuses a folder of another one. Once trials go on until a test has decided, they always do.
+fn plan(a: &mut Arguments) -> anyhow::Result<()> {
     // What all runs of a folder share; pairs, methods and seeds may become more.
-    let mine = serde_json::json!({
+    let mut mine = serde_json::json!({
         "version": env!("CARGO_PKG_VERSION"),
         "preset": a.preset,
         "overrides": a.set,
         "trials": a.trials,
         "evaluation_seed": a.evaluation_seed,
     });
+    let asked = a.until_decided;
+    let mut with = |most: Option<usize>| {
+        if let Some(most) = most {
+            mine["until_decided"] = most.into();
+        }
+        mine.clone()
+    };
     let path = a.out.join("plan.json");
     if path.exists() {
         let there: serde_json::Value = serde_json::from_str(&read_text(&path)?)
             .with_context(|| format!("{}: expected the plan of a comparison", path.display()))?;
+        let planned = there.get("until_decided").and_then(serde_json::Value::as_u64);
+        let planned = planned.and_then(|most| usize::try_from(most).ok());
+        a.until_decided = asked.or(planned);
+        let mine = with(planned.and(a.until_decided));
         ensure!(there == mine, "{} is another comparison: expected {mine}, found {there}", a.out.display());
+        if planned.is_none() && asked.is_some() {
+            write_atomic(&path, format!("{}\n", serde_json::to_string_pretty(&with(asked))?).as_bytes())?;
+        }
         return Ok(());
     }
+    let mine = with(asked);
     ensure!(!a.merge, "{}: expected a folder of a comparison, found no plan.json", a.out.display());
     let filled = std::fs::read_dir(&a.out).is_ok_and(|mut entries| entries.next().is_some());
     ensure!(!filled, "{} exists and is no comparison: give --out another folder", a.out.display());
@@ -204,12 +234,7 @@ fn run(a: &Arguments, job: &Job, all: &[Job], stop: &Stop) -> anyhow::Result<()>
     let (results, _) = Run::open(&options)?.learn()?;
     let last = results.iterations.last().map_or(0, |i| i.iteration);
     let progress = Progress::new(a.quiet).stopping(stop.clone());
-    let measure = |iteration: u32| -> anyhow::Result<Evaluation> {
-        let published = Published::open(&folder.join(format!("iteration_{iteration:02}/policy")))?;
-        let envs = published.envs(published.config.evaluation.parallel.min(a.trials))?;
-        let policy = &published.policy;
-        Ok(evaluate(envs, policy, Direction::Hard, a.trials, a.evaluation_seed, None, &progress)?.evaluation)
-    };
+    let measure = |iteration: u32| measure(a, job, iteration, 0..a.trials, &progress);
     let initial = measure(0)?;
     let compared = ComparedRun {
         last: if last == 0 { initial.clone() } else { measure(last)? },
@@ -220,6 +245,64 @@ fn run(a: &Arguments, job: &Job, all: &[Job], stop: &Stop) -> anyhow::Result<()>
         results,
     };
     write_atomic(&job.file(&a.out, "json"), serde_json::to_string(&compared)?.as_bytes())?;
+    Ok(())
+}
+
+/// A policy of a run on trials of the comparison.
+fn measure(
+    a: &Arguments,
+    job: &Job,
+    iteration: u32,
+    trials: Range<usize>,
+    progress: &Progress,
+) -> anyhow::Result<Evaluation> {
+    let folder = job.folder(&a.out).join(format!("iteration_{iteration:02}/policy"));
+    let published = Published::open(&folder)?;
+    let envs = published.envs(published.config.evaluation.parallel.min(trials.len()))?;
+    let policy = &published.policy;
+    Ok(evaluate(envs, policy, Direction::Hard, trials, a.evaluation_seed, None, progress)?.evaluation)
+}
+
+/// Trials that are added at once, where a test has not decided.
+const BLOCK: usize = 50;
+
+/// Adds trials to last policies until a test tells every one from the reference's, or there are as many as there may be. What is added is
+/// stored, so the same command goes on from there.
+fn decide(a: &Arguments, jobs: &[Job], stop: &Stop) -> anyhow::Result<()> {
+    let Some(most) = a.until_decided else { return Ok(()) };
+    let progress = Progress::new(a.quiet).stopping(stop.clone());
+    loop {
+        let comparison = read(a, jobs)?;
+        let open = comparison.undecided();
+        if open.is_empty() {
+            return Ok(());
+        }
+        for v in open {
+            progress.say(&format!(
+                "{}, seed {}: {} trials do not tell {} from {}",
+                v.task, v.seed, v.trials, v.method, comparison.reference
+            ));
+            for method in [&comparison.reference, &v.method] {
+                let job = Job { task: v.task.clone(), method: method.clone(), seed: v.seed };
+                extend(a, &job, (v.trials + BLOCK).min(most), &progress)?;
+            }
+        }
+    }
+}
+
+/// Measures the last policy of a run on more trials, up to `wanted` of them.
+fn extend(a: &Arguments, job: &Job, wanted: usize, progress: &Progress) -> anyhow::Result<()> {
+    let mut run = stored(a, job)?;
+    let done = run.last.trials;
+    if done >= wanted {
+        return Ok(());
+    }
+    let last = run.results.iterations.last().map_or(0, |i| i.iteration);
+    let more = measure(a, job, last, done..wanted, progress)?;
+    let mut outcomes = std::mem::take(&mut run.last.outcomes);
+    outcomes.extend(more.outcomes);
+    run.last = Evaluation::new(outcomes, run.last.seconds + more.seconds);
+    write_atomic(&job.file(&a.out, "json"), serde_json::to_string(&run)?.as_bytes())?;
     Ok(())
 }
 
@@ -338,24 +421,27 @@ fn end(running: Vec<Running>) {
     }
 }
 
-/// Writes the comparison of all runs that are there.
-fn finish(a: &Arguments, jobs: &[Job]) -> anyhow::Result<()> {
-    let mut runs = vec![];
-    for job in jobs {
-        let path = job.file(&a.out, "json");
-        if path.exists() {
-            let text = read_text(&path)?;
-            runs.push(
-                serde_json::from_str(&text)
-                    .with_context(|| format!("{}: expected a compared run", path.display()))?,
-            );
-        }
-    }
+/// What a run that is done measured.
+fn stored(a: &Arguments, job: &Job) -> anyhow::Result<ComparedRun> {
+    let path = job.file(&a.out, "json");
+    serde_json::from_str(&read_text(&path)?)
+        .with_context(|| format!("{}: expected a compared run", path.display()))
+}
+
+/// The comparison of all runs that are there.
+fn read(a: &Arguments, jobs: &[Job]) -> anyhow::Result<Comparison> {
+    let there = jobs.iter().filter(|j| j.file(&a.out, "json").exists());
+    let runs: Vec<ComparedRun> = there.map(|job| stored(a, job)).collect::<anyhow::Result<_>>()?;
     if runs.is_empty() {
         bail!("none of the {} runs is done", jobs.len());
     }
-    let there = runs.len();
-    let comparison = Comparison::new(&a.methods[0], a.evaluation_seed, runs)?;
+    Ok(Comparison::new(&a.methods[0], a.evaluation_seed, a.until_decided, runs)?)
+}
+
+/// Writes the comparison of all runs that are there.
+fn finish(a: &Arguments, jobs: &[Job]) -> anyhow::Result<()> {
+    let comparison = read(a, jobs)?;
+    let there = comparison.runs.len();
     comparison.write(&a.out)?;
     say(compare::table(&comparison))?;
     say(format_args!("{there} of {} runs: {}", jobs.len(), a.out.join("compare.html").display()))?;

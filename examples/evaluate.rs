@@ -67,7 +67,7 @@ fn program() -> anyhow::Result<()> {
     let filming = Filming { trials: Filmed::FailuresFirst(a.filmed), camera: "table".to_owned(), size: 200 };
     let filming = a.video.is_some().then_some(&filming);
     let envs = published.envs(parallel)?;
-    let done = evaluate(envs, policy, direction, a.trials, a.seed, filming, &progress)?;
+    let done = evaluate(envs, policy, direction, 0..a.trials, a.seed, filming, &progress)?;
     let result = &done.evaluation;
     if let Some(path) = &a.video {
         let (outcomes, frames): (Vec<_>, Vec<_>) = done.films.into_iter().unzip();

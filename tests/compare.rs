@@ -88,6 +88,19 @@ fn all_methods_on_two_pairs_stopped_sharded_and_merged() {
     let first = out.join("nut_assembly/auto-e2h-0/iteration_00/policy/policy.json");
     assert_eq!(provenance, std::fs::read_to_string(first).unwrap());
 
+    // Four trials tell nothing apart, so there are more; once that is the plan, it stays so.
+    assert_success(&compare(&out, &["--until-decided", "8"]).output().unwrap());
+    let json = std::fs::read_to_string(out.join("compare.json")).unwrap();
+    let more: Comparison = serde_json::from_str(&json).unwrap();
+    assert_eq!(more.until_decided, Some(8));
+    for (before, after) in comparison.runs.iter().zip(&more.runs) {
+        assert_eq!(after.last.outcomes.len(), 8, "{}", after.results.method);
+        assert_eq!(after.last.outcomes[..4], before.last.outcomes[..], "{}", after.results.method);
+    }
+    assert_success(&compare(&out, &["--merge"]).output().unwrap());
+    assert_eq!(std::fs::read_to_string(out.join("compare.json")).unwrap(), json);
+    assert!(std::fs::read_to_string(out.join("compare.html")).unwrap().contains("s a demonstration"));
+
     // What is not of this comparison is refused before any work.
     let refused = |arguments: &[&str], words: &[&str]| {
         let output = compare(&out, arguments).output().unwrap();
@@ -98,6 +111,8 @@ fn all_methods_on_two_pairs_stopped_sharded_and_merged() {
     };
     refused(&["--set", "loop.cycles=3"], &["another comparison", "loop.cycles=3"]);
     refused(&["--evaluation-seed", "1"], &["another comparison", "800000"]);
+    refused(&["--until-decided", "9"], &["another comparison", "until_decided"]);
+    refused(&["--until-decided", "3"], &["--until-decided", "--trials (4)"]);
     refused(&["--shard", "3/2"], &["--shard", "1 to N", "3/2"]);
     refused(&["--only", "disk/auto-e2h/7"], &["--only", "disk/auto-e2h/7"]);
 }

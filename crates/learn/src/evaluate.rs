@@ -5,6 +5,7 @@ use crate::rollout::{self, Film, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Image, Outcome, Policy, stream};
 use e2h_env::Env;
+use std::ops::Range;
 use std::time::Instant;
 
 /// Which trials of an evaluation are shown.
@@ -46,8 +47,8 @@ struct Queue {
     done: Vec<(usize, Trial, Option<Film>)>,
 }
 
-/// Runs `trials` trials of `direction` from external resets drawn from `seed`, several simulations side by side.
-/// `envs` are fresh simulations of the same task, one a lane. Filming changes nothing else: a trial's last bits depend on how many
+/// Runs the trials of `direction` with these numbers from external resets drawn from `seed`, several simulations side by side: `0..50` are the
+/// first fifty, `50..100` go on from there. `envs` are fresh simulations of the same task, one a lane. Filming changes nothing else: a trial's last bits depend on how many
 /// others the policy answers with it, so a film is of the evaluation itself and shows what was counted.
 ///
 /// # Errors
@@ -57,25 +58,25 @@ pub fn evaluate(
     mut envs: Vec<Env>,
     policy: &dyn Policy,
     direction: Direction,
-    trials: usize,
+    trials: Range<usize>,
     seed: u64,
     filming: Option<&Filming>,
     progress: &Progress,
 ) -> Result<Evaluated> {
     let start = Instant::now();
     let n = envs.len();
-    if n == 0 || trials == 0 {
+    if n == 0 || trials.is_empty() {
         return Err(Error::Config("evaluation needs at least one simulation and one trial".to_owned()));
     }
-    if trials > MOST_TRIALS {
-        return Err(Error::Config(format!("trials: expected at most {MOST_TRIALS}, got {trials}")));
+    if trials.end > MOST_TRIALS {
+        return Err(Error::Config(format!("trials: expected at most {MOST_TRIALS}, got {}", trials.end)));
     }
     if let (Some(f), Some(env)) = (filming, envs.first_mut()) {
         env.render(&f.camera, f.size, f.size)?;
     }
     let films = |trial: usize| {
         filming.is_some_and(|f| match f.trials {
-            Filmed::First(n) => trial < n,
+            Filmed::First(n) => trial - trials.start < n,
             Filmed::FailuresFirst(n) => n > 0,
         })
     };
@@ -95,14 +96,15 @@ pub fn evaluate(
         .into_iter()
         .enumerate()
         .map(|(i, env)| {
-            let queue = Queue { trials: (i..trials).step_by(n).rev().collect(), current: 0, done: vec![] };
+            let mine = trials.clone().skip(i).step_by(n);
+            let queue = Queue { trials: mine.rev().collect(), current: 0, done: vec![] };
             Lane { env, rollout: None, state: queue }
         })
         .collect();
     for lane in &mut lanes {
         begin(lane)?;
     }
-    let bar = progress.bar("evaluate", trials as u64);
+    let bar = progress.bar("evaluate", trials.len() as u64);
     drive(
         &mut lanes,
         policy,
@@ -143,6 +145,6 @@ pub fn evaluate(
         }
     }
     let evaluation = Evaluation::new(results, start.elapsed().as_secs_f64());
-    bar.finish(&format!("{} of {trials} succeeded", evaluation.successes));
+    bar.finish(&format!("{} of {} succeeded", evaluation.successes, trials.len()));
     Ok(Evaluated { evaluation, films })
 }

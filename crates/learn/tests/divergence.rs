@@ -130,7 +130,8 @@ fn a_start_that_diverges_is_drawn_again_and_counted() {
     let collected = collected(env(2, (0.0, 0))).unwrap();
     assert_eq!(resets(&collected), [(ResetCause::ResetDiverged, 2), (ResetCause::Start, 1)]);
     let evaluated =
-        evaluate(vec![env(3, (0.0, 0))], &Still, Direction::Hard, 2, 0, None, &Progress::new(true)).unwrap();
+        evaluate(vec![env(3, (0.0, 0))], &Still, Direction::Hard, 0..2, 0, None, &Progress::new(true))
+            .unwrap();
     assert_eq!(evaluated.evaluation.outcomes.len(), 2);
 }
 

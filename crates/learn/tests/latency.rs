@@ -76,7 +76,8 @@ fn trials_take_the_time_that_the_policy_thinks() {
     let calls = |latency| {
         let policy = Rise::default();
         let done =
-            evaluate(vec![env(latency)], &policy, Direction::Hard, 1, 5, None, &Progress::new(true)).unwrap();
+            evaluate(vec![env(latency)], &policy, Direction::Hard, 0..1, 5, None, &Progress::new(true))
+                .unwrap();
         assert_eq!(done.evaluation.outcomes[0].steps, 24, "the clock runs on");
         policy.0.into_inner().unwrap().len()
     };

@@ -8,7 +8,7 @@ mod paper;
 mod text;
 
 use crate::record::{Evaluation, RunResults};
-use crate::statistics::{Difference, Discordant, Pair, difference, holm, mcnemar_mid_p};
+use crate::statistics::{Difference, Discordant, Pair, difference, e_value, holm, mcnemar_mid_p};
 use crate::{Error, Result};
 use e2h_core::stream;
 use serde::{Deserialize, Serialize};
@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 pub use page::html;
-pub use paper::{Figure, Suite, suite};
+pub use paper::{Cost, Figure, Suite, cost, suite};
 pub use text::{iterations_csv, table, trials_csv};
 
 /// Significance that verdicts ask for, after Holm's adjustment.
@@ -41,8 +41,12 @@ pub struct ComparedRun {
 pub struct Comparison {
     /// Method that the others are compared with.
     pub reference: String,
-    /// Trials of each first and last policy.
+    /// Trials of each first policy, and at least of each last one.
     pub trials: usize,
+    /// Where trials of last policies were added until a test had decided: the most of them. Verdicts are then by e-values, which
+    /// allow to stop at any time; by McNemar's test otherwise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until_decided: Option<usize>,
     /// Seed of these trials.
     pub evaluation_seed: u64,
     /// The runs, by pair, method and seed.
@@ -58,9 +62,12 @@ pub struct Verdict {
     pub method: String,
     /// Training seed.
     pub seed: u64,
+    /// Trials that both have.
+    pub trials: usize,
     /// Pairs of trials in which they differ; `ours` are the method's.
     pub pairs: Discordant,
-    /// McNemar's mid-p, adjusted over the methods that were compared on this pair and seed.
+    /// McNemar's mid-p, or 1 / E where trials were added until a test had decided; adjusted over the methods that were compared
+    /// on this pair and seed.
     pub p: f64,
 }
 
@@ -80,8 +87,15 @@ impl Comparison {
     ///
     /// # Errors
     /// [`Error::Options`] when there is none, when two are of the same pair, method and seed, when runs differ in preset, version, or overrides, or
-    /// of one pair in variant or number of demonstrations, or when one was measured on other trials.
-    pub fn new(reference: &str, evaluation_seed: u64, mut runs: Vec<ComparedRun>) -> Result<Self> {
+    /// of one pair in variant or number of demonstrations, or when one was measured on other trials (more of them are none, where
+    /// `until_decided` says so).
+    pub fn new(
+        reference: &str,
+        evaluation_seed: u64,
+        until_decided: Option<usize>,
+        mut runs: Vec<ComparedRun>,
+    ) -> Result<Self> {
+        const LAST: &str = "the last policy's trials";
         let key = |r: &ComparedRun| (r.results.task.clone(), r.results.method.clone(), r.results.seed);
         // The reference first, then by name.
         runs.sort_by_key(|r| {
@@ -101,7 +115,7 @@ impl Comparison {
                 name(b)
             )))
         };
-        let trials = first.last.trials;
+        let trials = first.initial.trials;
         for (a, b) in runs.iter().map(|b| (first, b)).chain(runs.windows(2).map(|w| (&w[0], &w[1]))) {
             let (x, y) = (&a.results, &b.results);
             for (what, expected, found) in
@@ -114,10 +128,12 @@ impl Comparison {
             if x.overrides != y.overrides {
                 return differ(a, b, "overrides", &x.overrides.join(" "), &y.overrides.join(" "));
             }
-            for (what, e) in
-                [("the initial policy's trials", &b.initial), ("the last policy's trials", &b.last)]
-            {
-                if e.trials != trials || e.outcomes.len() != trials {
+            for (what, e) in [("the initial policy's trials", &b.initial), (LAST, &b.last)] {
+                let fits = match until_decided {
+                    Some(most) if what == LAST => (trials..=most.max(trials)).contains(&e.trials),
+                    _ => e.trials == trials,
+                };
+                if !fits || e.outcomes.len() != e.trials {
                     return differ(a, b, what, &trials.to_string(), &e.outcomes.len().to_string());
                 }
             }
@@ -132,7 +148,7 @@ impl Comparison {
         if let Some(w) = runs.windows(2).find(|w| key(&w[0]) == key(&w[1])) {
             return Err(Error::Options(format!("compare: two runs of {}", name(&w[0]))));
         }
-        Ok(Self { reference: reference.to_owned(), trials, evaluation_seed, runs })
+        Ok(Self { reference: reference.to_owned(), trials, until_decided, evaluation_seed, runs })
     }
 
     /// Pairs of tasks, in order.
@@ -172,11 +188,15 @@ impl Comparison {
             let Some(reference) = self.run(&r.task, &self.reference, r.seed) else { continue };
             let pairs = Discordant::of(&successes(&run.last), &successes(&reference.last));
             let (task, method) = (r.task.clone(), r.method.clone());
-            let p = mcnemar_mid_p(pairs);
+            let p = match self.until_decided {
+                Some(_) => (1.0 / e_value(pairs)).min(1.0),
+                None => mcnemar_mid_p(pairs),
+            };
             groups.entry((&r.task, r.seed)).or_default().push(Verdict {
                 task,
                 method,
                 seed: r.seed,
+                trials: run.last.trials.min(reference.last.trials),
                 pairs,
                 p,
             });
@@ -187,6 +207,13 @@ impl Comparison {
             all.extend(group.into_iter().zip(adjusted).map(|(v, p)| Verdict { p, ..v }));
         }
         all
+    }
+
+    /// Verdicts that more trials may still change: no test has decided, and there may be more.
+    #[must_use]
+    pub fn undecided(&self) -> Vec<Verdict> {
+        let most = self.until_decided.unwrap_or(0);
+        self.verdicts().into_iter().filter(|v| v.p >= ALPHA && v.trials < most).collect()
     }
 
     /// Every method against the reference, over the pairs that `among` holds for. The bootstrap's draws are seeded, so the same
@@ -303,7 +330,48 @@ mod tests {
                 runs.push(run(task, "no-critic", seed, if seed % 2 == 0 { 35 } else { 37 }));
             }
         }
-        Comparison::new("auto-e2h", 800_000, runs).unwrap()
+        Comparison::new("auto-e2h", 800_000, None, runs).unwrap()
+    }
+
+    #[test]
+    fn trials_are_added_until_a_test_has_decided_and_verdicts_are_then_by_e_values() {
+        let mut runs = comparison().runs;
+        assert!(comparison().undecided().is_empty(), "nobody asked for it");
+        let sequential = |runs: &[ComparedRun]| Comparison::new("auto-e2h", 800_000, Some(60), runs.to_vec());
+        let c = sequential(&runs).unwrap();
+        // 1 / E of 21 to 0 is clear; 1 or 0 pairs are not.
+        let open = c.undecided();
+        assert!(!open.is_empty() && open.iter().all(|v| v.method == "no-critic" && v.trials == 40));
+        for v in c.verdicts() {
+            // Two methods are compared: Holm doubles the smaller of two.
+            let p = (1.0 / e_value(v.pairs)).min(1.0);
+            assert!((v.p - (2.0 * p).min(1.0)).abs() < 1e-12 || v.p >= p, "{v:?}");
+        }
+        // More trials of some policies are in order; what both have counts.
+        let more = runs.iter_mut().find(|r| r.results.method == "no-critic" && r.results.seed == 0).unwrap();
+        more.last = Evaluation::new(vec![more.last.outcomes[0]; 60], 1.0);
+        let c = sequential(&runs).unwrap();
+        assert!(c.verdicts().iter().all(|v| v.trials == 40));
+        assert!(html(&c).contains("E-value"), "the page says what it went by");
+        // Without the word they are other trials.
+        let told = Comparison::new("auto-e2h", 800_000, None, runs).unwrap_err().to_string();
+        assert!(told.contains("expected 40, found 60"), "{told}");
+    }
+
+    #[test]
+    fn what_demonstrations_cost_is_told_where_there_are_hard_ones() {
+        let mut runs = comparison().runs;
+        assert!(!html(&comparison()).contains("s a demonstration"));
+        for seed in 0..5 {
+            let mut hard = run("disk", "hard-demos", seed, 30);
+            hard.results.hard_demonstration_steps = Some(342.0);
+            runs.push(hard);
+        }
+        let page = html(&Comparison::new("auto-e2h", 800_000, None, runs).unwrap());
+        // 171 steps at 20 Hz against 342; 36 of 40 against 30.
+        for word in ["s a demonstration", "8.6", "17.1", "50%", "180/200", "150/200", "+15.0"] {
+            assert!(page.contains(word), "{word}");
+        }
     }
 
     #[test]
@@ -326,7 +394,7 @@ mod tests {
         assert!(no_critic.difference.p.unwrap() > ALPHA, "{no_critic:?}");
         // Four seeds are too few for a p-value of the method.
         let few: Vec<_> = c.runs.into_iter().filter(|r| r.results.seed < 4).collect();
-        let few = Comparison::new("auto-e2h", 800_000, few).unwrap();
+        let few = Comparison::new("auto-e2h", 800_000, None, few).unwrap();
         assert!(few.standings(|_| true).iter().all(|s| s.difference.p.is_none()));
     }
 
@@ -335,7 +403,7 @@ mod tests {
         let refused = |change: fn(&mut Vec<ComparedRun>)| {
             let mut runs = comparison().runs;
             change(&mut runs);
-            Comparison::new("auto-e2h", 800_000, runs).unwrap_err().to_string()
+            Comparison::new("auto-e2h", 800_000, None, runs).unwrap_err().to_string()
         };
         let told = refused(|r| r[3].results.preset = "paper".to_owned());
         assert!(told.contains("disk, auto-e2h, seed 3") && told.contains("preset"), "{told}");

@@ -5,6 +5,7 @@ use crate::page::{document, figure, section, table};
 use crate::record::wilson95;
 use crate::svg::{self, Axes, colour, escape, legend, percent, ticks};
 use crate::table::interval;
+use e2h_core::CONTROL_HZ;
 use std::collections::BTreeSet;
 
 const WIDTH: f64 = 720.0;
@@ -34,6 +35,7 @@ pub fn html(c: &Comparison) -> String {
         let content = figure("", &curves(c, task)) + &policies(c, task) + &filters(&of);
         body += &section(&title, &content);
     }
+    body += &costs(c);
     body += &section("Automatic resets", &resets(c));
     body += &section("Provenance", &provenance(c));
     document(&format!("Comparison: {}", methods.join(", ")), &body)
@@ -48,9 +50,13 @@ fn lead(c: &Comparison) -> String {
     } else {
         format!("Against {}: {}.", c.reference, words.join("; "))
     };
+    let trials = match c.until_decided {
+        Some(most) => format!("{} to {most}", c.trials),
+        None => c.trials.to_string(),
+    };
     format!(
-        "{against} What counts is the last policy, over {} trials that all policies share (seed {}).",
-        c.trials, c.evaluation_seed
+        "{against} What counts is the last policy, over {trials} trials that all policies share (seed {}).",
+        c.evaluation_seed
     )
 }
 
@@ -238,18 +244,72 @@ fn policies(c: &Comparison, task: &str) -> String {
             ]
         })
         .collect();
-    let head = [
-        "policy",
-        "initial",
-        "last",
-        "best on the way",
-        "only it, only reference",
-        "McNemar p, Holm",
-        "minutes",
-    ];
-    let note = "<p class=\"note\">p of McNemar's test (mid-p). Only it, only reference: trials in which one of the two succeeded. Best on the way is over the run's own \
-                trials, chosen afterwards, and counts for nothing.</p>";
-    table(&head, &rows) + note
+    let (p, test) = match c.until_decided {
+        Some(_) => (
+            "1 / E, Holm",
+            "E-value of the pairs of trials that differ: it may be looked at after every block of trials, and they were added until it had decided",
+        ),
+        None => ("McNemar p, Holm", "p of McNemar's test (mid-p)"),
+    };
+    let head = ["policy", "initial", "last", "best on the way", "only it, only reference", p, "minutes"];
+    let note = format!(
+        "<p class=\"note\">{test}. Only it, only reference: trials in which one of the two succeeded. Best on the way is over the run's own \
+         trials, chosen afterwards, and counts for nothing.</p>"
+    );
+    table(&head, &rows) + &note
+}
+
+/// What demonstrations of either direction cost and what became of them; nothing where no run has hard ones.
+fn costs(c: &Comparison) -> String {
+    let seconds = |steps: f64| steps / CONTROL_HZ;
+    let mut rows = vec![];
+    for task in c.tasks() {
+        let with: Vec<&ComparedRun> = c
+            .runs
+            .iter()
+            .filter(|r| r.results.task == task && r.results.hard_demonstration_steps.is_some())
+            .collect();
+        if with.is_empty() {
+            continue;
+        }
+        let mean =
+            |of: &dyn Fn(&ComparedRun) -> f64| with.iter().map(|r| of(r)).sum::<f64>() / with.len() as f64;
+        let easy = mean(&|r| seconds(r.results.demonstration_steps));
+        let hard = mean(&|r| seconds(r.results.hard_demonstration_steps.unwrap_or_default()));
+        let ours = Pooled::of(c.of(task, &c.reference).map(|r| &r.last));
+        let theirs = Pooled::of(with.iter().map(|r| &r.last));
+        let share = |p: Pooled| p.successes as f64 / p.trials as f64;
+        let gain = (ours.trials > 0).then(|| points(share(ours) - share(theirs)));
+        let paper = paper::cost(task).map_or("–".to_owned(), |p| {
+            format!(
+                "{:.1} and {:.1} s, {} and {}%, {:+}",
+                p.easy_s,
+                p.hard_s,
+                p.ours,
+                p.hard,
+                i32::from(p.ours) - i32::from(p.hard)
+            )
+        });
+        rows.push(vec![
+            escape(task),
+            format!("{easy:.1}"),
+            format!("{hard:.1}"),
+            percent(1.0 - easy / hard),
+            short(ours),
+            short(theirs),
+            gain.unwrap_or("–".to_owned()),
+            paper,
+        ]);
+    }
+    if rows.is_empty() {
+        return String::new();
+    }
+    let ours = format!("{}, easy", escape(&c.reference));
+    let head = ["pair", "easy, s", "hard, s", "time saved", &ours, "hard alone", "points", "paper"];
+    let note = "<p class=\"note\">Seconds of robot time (s a demonstration, mean) of the scripted demonstrators, and success of the last policy that began \
+                with as many easy demonstrations and of one that learned from the hard ones alone. A script does not pay for difficulty as a person does: \
+                a hard task is no slower for it. The paper's are of people at real robots, 50 demonstrations and 20 trials an entry.</p>";
+    section("What demonstrations cost", &(table(&head, &rows) + note))
 }
 
 fn filters(runs: &[&ComparedRun]) -> String {

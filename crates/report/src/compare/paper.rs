@@ -58,6 +58,35 @@ const SUITES: [Suite; 3] = [
     },
 ];
 
+/// What demonstrations cost in the paper, and what became of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Cost {
+    /// Seconds an easy demonstration.
+    pub easy_s: f64,
+    /// Seconds a hard one.
+    pub hard_s: f64,
+    /// Success of the paper's method, from easy demonstrations, per cent.
+    pub ours: u8,
+    /// Success of a policy from hard ones, per cent.
+    pub hard: u8,
+}
+
+/// The row of a pair; none for pairs that the paper's table does not have.
+///
+/// # Source
+/// The paper's table of collection costs.
+#[must_use]
+pub fn cost(task: &str) -> Option<Cost> {
+    let (easy_s, hard_s, ours, hard) = match task {
+        "disk" => (19.5, 41.5, 65, 50),
+        "mouse" => (24.1, 54.7, 70, 60),
+        "test_tube" => (19.6, 39.1, 75, 55),
+        "brush" => (19.0, 62.8, 70, 60),
+        _ => return None,
+    };
+    Some(Cost { easy_s, hard_s, ours, hard })
+}
+
 /// The suite that a pair is of; none for pairs that the paper does not have.
 ///
 /// # Source

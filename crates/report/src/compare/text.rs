@@ -44,19 +44,23 @@ fn variant(name: &str) -> &str {
     if name.is_empty() { "default" } else { name }
 }
 
-/// A row an iteration of every run, as each measured itself.
+/// A row an iteration of every run, as each measured itself; control steps of collection and training steps add up.
 #[must_use]
 pub fn iterations_csv(c: &Comparison) -> String {
     let mut s =
-        "task,variant,preset,method,seed,iteration,successes,trials,wilson_low,wilson_high,minutes,automatic_reset_rate\n"
+        "task,variant,preset,method,seed,iteration,successes,trials,wilson_low,wilson_high,env_steps,updates,minutes,\
+         automatic_reset_rate\n"
             .to_owned();
     for r in c.runs.iter().map(|r| &r.results) {
+        let (mut env_steps, mut updates) = (0, 0);
         for i in &r.iterations {
             let e = &i.evaluation;
+            env_steps += i.collection.as_ref().map_or(0, |c| c.steps);
+            updates += i.updates;
             let resets =
                 i.collection.as_ref().map_or(String::new(), |c| format!("{:.4}", c.automatic_reset_rate()));
             s += &format!(
-                "{},{},{},{},{},{},{},{},{:.4},{:.4},{:.2},{resets}\n",
+                "{},{},{},{},{},{},{},{},{:.4},{:.4},{env_steps},{updates},{:.2},{resets}\n",
                 r.task,
                 variant(&r.variant),
                 r.preset,

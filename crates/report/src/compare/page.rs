@@ -305,7 +305,7 @@ fn costs(c: &Comparison) -> String {
         return String::new();
     }
     let ours = format!("{}, easy", escape(&c.reference));
-    let head = ["pair", "easy, s", "hard, s", "time saved", &ours, "hard alone", "points", "paper"];
+    let head = ["pair", "easy, s", "hard, s", "time saved", &ours, "hard alone", "gain, points", "paper"];
     let note = "<p class=\"note\">Seconds of robot time (s a demonstration, mean) of the scripted demonstrators, and success of the last policy that began \
                 with as many easy demonstrations and of one that learned from the hard ones alone. A script does not pay for difficulty as a person does: \
                 a hard task is no slower for it. The paper's are of people at real robots, 50 demonstrations and 20 trials an entry.</p>";

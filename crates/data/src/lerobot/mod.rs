@@ -30,6 +30,7 @@ mod robot;
 mod stats;
 mod table;
 mod tasks;
+mod thrift;
 mod video;
 mod writer;
 

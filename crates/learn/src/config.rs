@@ -1,16 +1,19 @@
 //! A run's configuration: preset < task file < `--set key=value`, checked before any work.
 
+mod layers;
 mod validate;
 
 use crate::methods::{DynamicsStage, RecapConfig};
 use crate::{Error, ExploreConfig, Result};
-use e2h_core::nearest;
 use e2h_env::{DemonstratorConfig, EnvConfig, Task, TaskOptions};
 use e2h_nn::Precision;
 use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
 use e2h_refine::{AdvantageConfig, GateConfig, GoalConfig, KinematicConfig, ReverseConfig, SuffixConfig};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
+
+pub(crate) use layers::suggestion;
+use layers::{find, inner, layer, merge, parse};
 
 const PRESETS: [(&str, &str); 3] = [
     ("smoke", include_str!("../../../configs/presets/smoke.toml")),
@@ -332,83 +335,6 @@ fn of_registry(task: &str) -> Result<&'static str> {
     e2h_env::configuration(task).ok_or_else(|| {
         Error::Config(format!("unknown task `{task}`; {}", suggestion(task, "", e2h_env::registry())))
     })
-}
-
-fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str> {
-    known.iter().find(|(n, _)| *n == name).map(|(_, text)| *text).ok_or_else(|| {
-        let names: Vec<&str> = known.iter().map(|(n, _)| *n).collect();
-        Error::Config(format!("unknown {what} `{name}`; {}", suggestion(name, "", &names)))
-    })
-}
-
-/// What may have been meant, or all that can be.
-pub(crate) fn suggestion(name: &str, prefix: &str, known: &[&str]) -> String {
-    match nearest(name, known.iter().copied()) {
-        Some(near) => format!("did you mean `{prefix}{near}`?"),
-        None => format!("known: {}", known.join(", ")),
-    }
-}
-
-fn parse(name: &str, text: &str) -> Result<Table> {
-    text.parse::<Table>().map_err(|e| Error::Config(format!("{name}: {}", e.message())))
-}
-
-/// Keys of earlier versions, and what says it now.
-const MOVED: [(&str, &str); 1] = [("train.step.adam.lr", "train.step.schedule.lr")];
-
-/// A table inside a table, if there is one.
-fn inner<'a>(table: Option<&'a Value>, key: &str) -> Option<&'a Table> {
-    table?.get(key)?.as_table()
-}
-
-/// The layer that one `key.path=value` lays over a configuration.
-fn layer(text: &str) -> Result<Table> {
-    let (key, value) = text
-        .split_once('=')
-        .ok_or_else(|| Error::Config(format!("--set: expected key=value, got `{text}`")))?;
-    let mut layer = Value::String(value.trim().to_owned());
-    // What is not TOML is taken as a plain string, so that quotes are not needed on the command line.
-    if let Ok(parsed) = format!("v = {value}").parse::<Table>()
-        && let Some(v) = parsed.get("v")
-    {
-        layer = v.clone();
-    }
-    let mut path: Vec<&str> = key.trim().split('.').collect();
-    let last = path.pop().unwrap_or_default();
-    let mut table = Table::from_iter([(last.to_owned(), layer)]);
-    for part in path.into_iter().rev() {
-        table = Table::from_iter([(part.to_owned(), Value::Table(table))]);
-    }
-    Ok(table)
-}
-
-/// Lays `over` onto `base`; a key that `base` does not have is unknown, because presets state every entry.
-fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
-    for (key, value) in over {
-        let full = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-        let Some(slot) = base.get_mut(key) else {
-            let known: Vec<&str> = base.keys().map(String::as_str).collect();
-            let prefix = if path.is_empty() { String::new() } else { format!("{path}.") };
-            let said = MOVED.iter().find(|(old, _)| *old == full).map_or_else(
-                || suggestion(key, &prefix, &known),
-                |(_, new)| format!("did you mean `{new}`?"),
-            );
-            return Err(Error::Config(format!("unknown key `{full}`; {said}")));
-        };
-        match (slot, value) {
-            (Value::Table(slot), Value::Table(value)) => merge(slot, value, &full)?,
-            (slot @ Value::Float(_), Value::Integer(i)) => *slot = Value::Float(*i as f64),
-            (slot, value) if slot.type_str() == value.type_str() => *slot = value.clone(),
-            (slot, value) => {
-                return Err(Error::Config(format!(
-                    "key `{full}`: expected a value of type {}, got {value} ({})",
-                    slot.type_str(),
-                    value.type_str()
-                )));
-            }
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]

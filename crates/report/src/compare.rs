@@ -216,7 +216,8 @@ impl Comparison {
         self.verdicts().into_iter().filter(|v| v.p >= ALPHA && v.trials < most).collect()
     }
 
-    /// Every method against the reference, over the pairs that `among` holds for. The bootstrap's draws are seeded, so the same
+    /// Every method against the reference, over the pairs that `among` holds for, on the trials that were fixed beforehand: a bootstrap knows
+    /// nothing of trials that were added because a test had not decided. The bootstrap's draws are seeded, so the same
     /// comparison gives the same numbers.
     #[must_use]
     pub fn standings(&self, among: impl Fn(&str) -> bool) -> Vec<Standing> {
@@ -229,7 +230,10 @@ impl Comparison {
                 .map(|task| {
                     let both = self.of(task, method).filter_map(|run| {
                         let reference = self.run(task, &self.reference, run.results.seed)?;
-                        Some((successes(&run.last), successes(&reference.last)))
+                        let fixed = |r: &ComparedRun| -> Vec<bool> {
+                            successes(&r.last).into_iter().take(self.trials).collect()
+                        };
+                        Some((fixed(run), fixed(reference)))
                     });
                     both.collect()
                 })
@@ -349,9 +353,12 @@ mod tests {
         }
         // More trials of some policies are in order; what both have counts.
         let more = runs.iter_mut().find(|r| r.results.method == "no-critic" && r.results.seed == 0).unwrap();
-        more.last = Evaluation::new(vec![more.last.outcomes[0]; 60], 1.0);
+        let failed = Trial { outcome: Outcome::Timeout, steps: 500 };
+        let trials = more.last.outcomes.iter().copied().chain([failed; 20]);
+        more.last = Evaluation::new(trials.collect(), 1.0);
         let c = sequential(&runs).unwrap();
         assert!(c.verdicts().iter().all(|v| v.trials == 40));
+        assert_eq!(c.standings(|_| true), sequential(&comparison().runs).unwrap().standings(|_| true));
         assert!(html(&c).contains("E-value"), "the page says what it went by");
         // Without the word they are other trials.
         let told = Comparison::new("auto-e2h", 800_000, None, runs).unwrap_err().to_string();

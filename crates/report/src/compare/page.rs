@@ -155,9 +155,10 @@ fn pooled(c: &Comparison) -> String {
         }
     }
     let head = ["suite, pairs", "method", "initial", "last", "paper: initial", "last"];
+    let added = c.until_decided.map_or("", |_| " Trials that were added count here, and stopping where a test has decided tilts a share a little.");
     let note = "<p class=\"note\">k/n over the pairs of a suite that ran and their training seeds, with 95% Wilson intervals of the pooled trials: they describe these \
-                policies, not how a method varies. The paper's pairs, robots and budgets are not ours; its figures are single runs.</p>";
-    table(&head, &rows) + note
+                policies, not how a method varies. The paper's pairs, robots and budgets are not ours; its figures are single runs.";
+    table(&head, &rows) + note + added + "</p>"
 }
 
 /// Success by iteration, one colour a method, trials of all seeds together.

@@ -69,6 +69,13 @@ pub trait Task: Send + Sync {
         *p
     }
 
+    /// Up to which turn from the home pose, rad to either side, the hand may put the object down at the end of the easy task: where
+    /// the hard task's objects start with any yaw, all the turns that grasp them. By default, for pairs whose objects start one
+    /// way or may be grasped any way: 0.
+    fn put_down_turn(&self) -> f64 {
+        0.0
+    }
+
     /// Whether the object has to be held throughout: dropping it then ends the episode.
     fn holds(&self) -> bool {
         false

@@ -26,6 +26,18 @@ const WAVES: usize = 3;
 /// Speed of the policy's own goals above which the excursion runs at its full rate, m/s: where the policy takes care, so does it.
 const FULL_SPEED: f64 = 0.1;
 
+/// Fastest that the hand turns to where it puts the object down, rad/s.
+const TURN_SPEED: f64 = 1.5;
+/// How far from where it held the object the empty hand begins to turn back, and over what distance it does, m.
+const LEAVES: (f64, f64) = (0.03, 0.10);
+
+/// How far the hand goes down in a control step, m, to put down an object that the policy lets go of in the air.
+const LOWER_M: f64 = 0.004;
+/// Object that comes down less than this in such a step lies on something, m.
+const LIES_M: f64 = 0.001;
+/// Most steps down, and steps in which the hand then stays where it is and opens.
+const LOWERING: (usize, usize) = (50, 5);
+
 /// How collection explores.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -53,6 +65,15 @@ pub struct ExploreConfig {
     /// hold the object throughout.
     #[serde(default)]
     pub grip_m: f64,
+    /// How much of the turns at which the object may be put down ([`e2h_env::Task::put_down_turn`]) is used, in [0, 1]: a rollout
+    /// draws its own turn evenly from them, the hand takes it once the object is clear, and keeps it until it leaves the object.
+    /// Reversed, the object is grasped at a turn that no demonstration may have shown, and turned back on the way. 0: the policy
+    /// chooses.
+    #[serde(default)]
+    pub turn: f64,
+    /// True: where the policy lets go of an object in the air, the hand brings it down first. Reversed, a fall has no grasp.
+    #[serde(default)]
+    pub lower: bool,
     /// Factor on the deviations of the excursion from one iteration to the next.
     pub growth: f64,
 }
@@ -70,6 +91,8 @@ impl Default for ExploreConfig {
             ramp_m: 0.08,
             release: 1.0,
             grip_m: 0.0,
+            turn: 0.0,
+            lower: false,
             growth: 1.0,
         }
     }
@@ -87,6 +110,7 @@ impl ExploreConfig {
         };
         within("share", self.share, [0.0, 1.0], "");
         within("release", self.release, [0.0, 1.0], "");
+        within("turn", self.turn, [0.0, 1.0], "");
         within("grip_m", self.grip_m, [0.0, LARGEST_GRIP_M], " m");
         within("growth", self.growth, [0.5, 2.0], "");
         within("ramp_m", self.ramp_m, [0.001, 1.0], " m");
@@ -127,6 +151,18 @@ impl ExploreConfig {
 /// Amplitude, frequency (Hz) and phase (rad) of one sinusoid.
 type Wave = (f64, f64, f64);
 
+/// What is done where a policy lets go.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Lowering {
+    /// Nothing yet.
+    Waits,
+    /// Steps down so far, height of the object before the last of them, and steps in which it did not come down.
+    Down(usize, f64, usize),
+    /// Steps in which the hand stays and opens.
+    Opens(usize),
+    Over,
+}
+
 /// The excursion of one rollout.
 #[derive(Debug, Clone)]
 pub(crate) struct Wander {
@@ -134,6 +170,10 @@ pub(crate) struct Wander {
     release: f64,
     /// Place of the grip along the jaws, m.
     grip: f64,
+    /// Turn from home at which the object is put down, as a share of the task's largest; None: as the policy wants.
+    turn: Option<f64>,
+    /// How much of the way from the policy's turn to that one is gone, in [0, 1].
+    turned: f64,
     /// Of x, y, z (m) and yaw (rad).
     axes: [[Wave; WAVES]; 4],
     /// Seconds that the excursion has run.
@@ -143,6 +183,11 @@ pub(crate) struct Wander {
     now: [f64; 4],
     /// By how much the object was out of where it may be put down when it was last held, m.
     back: [f64; 2],
+    /// Where the object was in the hand when it was last held, m.
+    held: Vector3<f64>,
+    /// Where the hand was on the object then, m.
+    on_object: Vector3<f64>,
+    lowering: Lowering,
 }
 
 impl Wander {
@@ -160,15 +205,21 @@ impl Wander {
         });
         // Drawn last, so that a run without it draws what it always did. Uniform, with the deviation asked for.
         let grip = 3.0_f64.sqrt() * config.grip_m * rng.random_range(-1.0..=1.0);
+        let turn = config.turn * rng.random_range(-1.0..=1.0);
         Self {
             ramp: config.ramp_m,
             release: config.release,
             grip,
+            turn: (config.turn > 0.0).then_some(turn),
+            turned: 0.0,
             axes,
             clock: 0.0,
             before: None,
             now: [0.0; 4],
             back: [0.0; 2],
+            held: Vector3::zeros(),
+            on_object: Vector3::zeros(),
+            lowering: if config.lower { Lowering::Waits } else { Lowering::Over },
         }
     }
 
@@ -176,6 +227,66 @@ impl Wander {
     pub(crate) fn now(&self) -> e2h_core::Excursion {
         // Stored episodes are f32.
         self.now.map(|v| v as f32)
+    }
+
+    /// How far the hand is from where it held the object, m.
+    fn away(&self, env: &Env) -> f64 {
+        let object = env.sim().object();
+        (env.sim().tcp().position - object.position - object.orientation * self.on_object).norm()
+    }
+
+    /// What to do before `action`, which lets go of an object in the air: another step down, or, where it lies, one in which the hand stays
+    /// and opens. None: the action itself.
+    pub(crate) fn before(&mut self, env: &Env, action: &Action) -> Option<Action> {
+        let sim = env.sim();
+        let height = sim.object().position.z;
+        if self.lowering == Lowering::Waits {
+            let lets_go = action[7] > 0.5 && !sim.opens() && sim.touching();
+            if !lets_go || !env.task().homes() || env.task().room(sim) <= 0.0 {
+                return None;
+            }
+            self.lowering = Lowering::Down(0, f64::INFINITY, 0);
+        }
+        let (mut goal, mut open) = (sim.goal(), false);
+        if let Lowering::Down(steps, before, lies) = self.lowering {
+            let lies = if before - height < LIES_M { lies + 1 } else { 0 };
+            if steps < LOWERING.0 && lies < 2 {
+                goal.position.z -= LOWER_M;
+                self.lowering = Lowering::Down(steps + 1, height, lies);
+            } else {
+                self.lowering = Lowering::Opens(0);
+            }
+        }
+        match self.lowering {
+            Lowering::Opens(steps) if steps < LOWERING.1 => {
+                // Not where the goal is by now, which is in the table.
+                goal.position.z = sim.tcp().position.z;
+                (self.lowering, open) = (Lowering::Opens(steps + 1), true);
+            }
+            Lowering::Opens(_) => self.lowering = Lowering::Over,
+            _ => {}
+        }
+        if matches!(self.lowering, Lowering::Over | Lowering::Waits) {
+            return None;
+        }
+        let mut out = *action;
+        out[..7].copy_from_slice(&goal.to_row(&[3, 4, 5, 6].map(|i| f64::from(action[i]))));
+        out[7] = f32::from(u8::from(open));
+        Some(out)
+    }
+
+    /// The part of the excursion that brings the hand's turn from `goal`'s to that of this rollout, rad.
+    fn turning(&mut self, env: &Env, goal: &Pose, free: f64, height: f64) -> f64 {
+        let (sim, largest) = (env.sim(), env.task().put_down_turn());
+        let Some(turn) = self.turn.filter(|_| largest > 0.0) else { return 0.0 };
+        let way = turn * largest - turn_from(&env.task().home(), goal);
+        let (from, over) = LEAVES;
+        let left = if sim.touching() { 0.0 } else { ((self.away(env) - from) / over).clamp(0.0, 1.0) };
+        // An object that is being put down is no longer turned: it would rub on the table.
+        let most = TURN_SPEED / CONTROL_HZ / way.abs().max(1e-6) * if sim.touching() { height } else { 1.0 };
+        let wanted = free.min(1.0 - left);
+        self.turned += (wanted - self.turned).clamp(-most, most);
+        self.turned * way
     }
 
     /// The action displaced, given the scene as it is.
@@ -189,6 +300,8 @@ impl Wander {
             f64::INFINITY
         } else if sim.touching() {
             sim.object().position.z - sim.object_start().position.z
+        } else if self.turn.is_some() {
+            self.away(env) - 0.02
         } else {
             (sim.tcp().position - sim.object().position).norm() - 0.04
         };
@@ -203,30 +316,50 @@ impl Wander {
             let wave = |&(amplitude, hz, phase): &Wave| amplitude * (TAU * hz * self.clock + phase).sin();
             *now = weight * axis.iter().map(wave).sum::<f64>();
         }
+        self.now[3] += self.turning(env, &goal, free, height);
         // Jaws close along the tool's y axis, and its z axis is the way it points.
         let grip = if env.task().homes() { Vector3::new(self.grip, 0.0, 0.0) } else { Vector3::zeros() };
+        let tcp = sim.tcp();
+        if sim.touching() {
+            let object = sim.object();
+            self.held = tcp.orientation.inverse() * (object.position - tcp.position);
+            self.on_object = object.orientation.inverse() * (tcp.position - object.position);
+        }
+        // A hand that takes a turn of its own goes round the object, which so comes to where the policy wants it.
+        let about = if self.turn.is_some() { self.held } else { Vector3::zeros() };
         let displaced = |[x, y, z, yaw]: [f64; 4]| {
             let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw) * goal.orientation;
-            Pose::new(goal.position + Vector3::new(x, y, z) + turn * grip, turn)
+            let round = goal.orientation * about - turn * about;
+            Pose::new(goal.position + Vector3::new(x, y, z) + round + turn * grip, turn)
         };
         // As the object comes down it is brought to where it may lie, as it sits in the hand.
         if sim.touching() {
-            let tcp = sim.tcp();
-            let held = tcp.orientation.inverse() * (sim.object().position - tcp.position);
             let there = displaced(self.now);
-            let lands = there.position + there.orientation * held;
+            let lands = there.position + there.orientation * self.held;
             let back = env.task().put_down(&lands) - lands;
             self.back = [back.x, back.y];
         }
+        // Policies whose objects lie at a strange turn let go early: it is brought there sooner.
+        let down = if self.turn.is_some() { (2.0 * (1.0 - height)).min(1.0) } else { 1.0 - height };
         for (now, back) in self.now.iter_mut().zip(self.back) {
-            *now += free * (1.0 - height) * back;
+            *now += free * down * back;
         }
         let displaced = displaced(self.now);
+        // The way round the object is a part of it.
+        let round = goal.orientation * about - displaced.orientation * about;
+        self.now.iter_mut().zip(&round).for_each(|(now, v)| *now += v);
         let mut out = *action;
         // The action's own hemisphere, so that no sign flips.
         out[..7].copy_from_slice(&displaced.to_row(&[3, 4, 5, 6].map(|i| f64::from(action[i]))));
         out
     }
+}
+
+/// The turn about the vertical from one pose to another, rad, in (-pi, pi].
+fn turn_from(from: &Pose, to: &Pose) -> f64 {
+    let q = to.orientation * from.orientation.inverse();
+    let angle = 2.0 * q.k.atan2(q.w);
+    angle - TAU * (angle / TAU).round()
 }
 
 #[cfg(test)]
@@ -258,6 +391,7 @@ mod tests {
         assert!(wrong(|c| c.band_hz = [0.0, 0.05]).contains("band_hz"));
         assert!(wrong(|c| c.share = 1.5).contains("share: expected 0 to 1"));
         assert!(wrong(|c| c.ramp_m = 0.0).contains("ramp_m"));
+        assert!(wrong(|c| c.turn = 1.5).contains("turn: expected 0 to 1"));
         assert!(wrong(|c| c.grip_m = 0.05).contains("grip_m: expected 0 to 0.03 m"));
         // 30 mm, doubled four times, are 480 mm.
         assert!(

@@ -7,7 +7,8 @@
 use crate::Result;
 use crate::explore::Wander;
 use e2h_core::{
-    ACTION_DIM, Action, Direction, Episode, Image, Observation, Origin, Outcome, Policy, Rng, stream,
+    ACTION_DIM, Action, Direction, Episode, Excursion, Image, Observation, Origin, Outcome, Policy, Rng,
+    stream,
 };
 use e2h_env::{Env, Snapshot};
 use rayon::prelude::*;
@@ -90,35 +91,57 @@ impl Rollout {
         let waits = std::iter::repeat_n(None, env.config().latency);
         let steps: Vec<Option<&Action>> = waits.chain(chunk.iter().map(Some)).collect();
         for (i, asked) in steps.iter().enumerate() {
+            // Without a recording only the observations that the next policy call gets are worth rendering.
+            let seen = self.episode.is_some() || i + self.history.len() >= steps.len();
             let excursion = self.wander.as_ref().map(Wander::now);
+            if let Some(asked) = asked {
+                while let Some(extra) = self.wander.as_mut().and_then(|w| w.before(env, asked)) {
+                    if let Some(done) = self.advance(env, &extra, excursion, true)? {
+                        return Ok(Some(done));
+                    }
+                }
+            }
             let action = match (asked, &mut self.wander) {
                 (None, _) => held,
                 (Some(action), None) => **action,
                 (Some(action), Some(wander)) => wander.displace(env, action),
             };
-            if let (Some(episode), Some(now)) = (&mut self.episode, self.history.back()) {
-                episode.push(now, &action)?;
-                if let (Some(row), Some(excursion)) = (episode.excursion.last_mut(), excursion) {
-                    *row = excursion;
-                }
+            if let Some(done) = self.advance(env, &action, excursion, seen)? {
+                return Ok(Some(done));
             }
-            let end = env.step(&action)?;
-            self.steps += 1;
-            if let Some(film) = self.film.as_mut().filter(|_| self.steps.is_multiple_of(2) || end.is_some()) {
-                film.shoot(env);
+        }
+        Ok(None)
+    }
+
+    /// One control step; Some when the episode ended with it. `seen`: what comes of it is worth rendering.
+    fn advance(
+        &mut self,
+        env: &mut Env,
+        action: &Action,
+        excursion: Option<Excursion>,
+        seen: bool,
+    ) -> Result<Option<Finished>> {
+        if let (Some(episode), Some(now)) = (&mut self.episode, self.history.back()) {
+            episode.push(now, action)?;
+            if let (Some(row), Some(excursion)) = (episode.excursion.last_mut(), excursion) {
+                *row = excursion;
             }
-            if let Some(outcome) = end {
-                let episode = self.episode.take().map(|mut episode| {
-                    episode.outcome = outcome;
-                    episode
-                });
-                return Ok(Some(Finished { outcome, steps: self.steps, episode, film: self.film.take() }));
-            }
-            // Without a recording only the observations that the next policy call gets are worth rendering.
-            if self.episode.is_some() || i + self.history.len() >= steps.len() {
-                self.history.pop_front();
-                self.history.push_back(env.observe()?);
-            }
+        }
+        let end = env.step(action)?;
+        self.steps += 1;
+        if let Some(film) = self.film.as_mut().filter(|_| self.steps.is_multiple_of(2) || end.is_some()) {
+            film.shoot(env);
+        }
+        if let Some(outcome) = end {
+            let episode = self.episode.take().map(|mut episode| {
+                episode.outcome = outcome;
+                episode
+            });
+            return Ok(Some(Finished { outcome, steps: self.steps, episode, film: self.film.take() }));
+        }
+        if seen {
+            self.history.pop_front();
+            self.history.push_back(env.observe()?);
         }
         Ok(None)
     }

@@ -66,7 +66,7 @@ fn collected_in(iteration: u32, explore: ExploreConfig, threads: usize) -> Colle
     collected_by(&OVER, iteration, explore, threads)
 }
 
-fn collected_by(easy: &Carry, iteration: u32, explore: ExploreConfig, threads: usize) -> Collected {
+fn collected_by(easy: &dyn Policy, iteration: u32, explore: ExploreConfig, threads: usize) -> Collected {
     let env = EnvConfig { cameras: false, horizon_hard: 16, horizon_easy: 150, ..EnvConfig::default() };
     let task = task("cube_pick_place", &TaskOptions::default()).unwrap();
     let mut config = RunConfig::resolve("smoke", "cube_pick_place", &[]).unwrap().config.closed_loop;
@@ -123,7 +123,7 @@ fn every_value_changes_what_is_collected() {
     let before = rows(&base);
     assert_eq!(before, rows(&base));
     type Change = fn(&mut ExploreConfig);
-    let changes: [(&str, Change); 8] = [
+    let changes: [(&str, Change); 9] = [
         ("enabled", |c| c.enabled = false),
         ("share", |c| c.share = 0.5),
         ("sideways_m", |c| c.sideways_m = 0.02),
@@ -132,6 +132,7 @@ fn every_value_changes_what_is_collected() {
         ("band_hz", |c| c.band_hz = [0.1, 0.3]),
         ("ramp_m", |c| c.ramp_m = 0.2),
         ("grip_m", |c| c.grip_m = 0.005),
+        ("turn", |c| c.turn = 1.0),
     ];
     for (name, change) in changes {
         let mut other = base.clone();
@@ -178,6 +179,82 @@ fn the_grip_is_beside_the_usual_place_and_the_object_stays_there_in_the_hand() {
     assert!(beside.iter().all(|x| x.abs() < 0.006 * 1.74 + 0.003), "{beside:?}");
     assert!(beside.iter().any(|x| x.abs() > 0.003), "{beside:?}");
     assert!(beside.iter().any(|x| (x - beside[0]).abs() > 0.002), "{beside:?}");
+}
+
+#[test]
+fn the_hand_takes_a_turn_of_its_own_once_the_object_is_clear_and_keeps_it() {
+    let still =
+        ExploreConfig { enabled: true, sideways_m: 0.0, up_m: 0.0, yaw_rad: 0.0, ..ExploreConfig::default() };
+    // The hand's turn at the end of each easy rollout, rad.
+    let turns = |explore: &ExploreConfig| -> Vec<f64> {
+        let all = collected_by(&OVER, 1, explore.clone(), 2).rejected;
+        all.iter()
+            .map(|e| {
+                let x = e.eef(e.len() - 1).orientation * nalgebra::Vector3::x();
+                let moved =
+                    |t: usize| (7..10).map(|i| (e.state[t][i] - e.state[0][i]).powi(2)).sum::<f32>().sqrt();
+                assert!((0..e.len()).all(|t| moved(t) > 0.045 || e.excursion[t] == [0.0; 4]));
+                x.y.atan2(x.x)
+            })
+            .collect()
+    };
+    assert!(turns(&still).iter().all(|turn| turn.abs() < 0.02));
+    let drawn = turns(&ExploreConfig { turn: 1.0, ..still.clone() });
+    let largest = std::f64::consts::FRAC_PI_4;
+    assert!(drawn.iter().all(|turn| turn.abs() < largest + 0.02), "{drawn:?}");
+    assert!(drawn.iter().any(|turn| (turn - drawn[0]).abs() > 0.2), "{drawn:?}");
+    let fewer = turns(&ExploreConfig { turn: 0.5, ..still });
+    assert!(
+        fewer.iter().zip(&drawn).all(|(half, turn)| (2.0 * half - turn).abs() < 0.04),
+        "{fewer:?} {drawn:?}"
+    );
+}
+
+/// Takes the cube to a place and lets go of it there, in the air, and stays.
+struct Drop;
+
+impl Policy for Drop {
+    fn n_obs_steps(&self) -> usize {
+        1
+    }
+
+    fn act(&self, histories: &[Vec<&Observation>], rngs: &mut [Rng]) -> e2h_core::Result<Vec<ActionChunk>> {
+        let mut chunks = Carry([0.52, -0.10, 0.10]).act(histories, rngs)?;
+        for (chunk, history) in chunks.iter_mut().zip(histories) {
+            let s = history[0].state;
+            let there = (s[7] - 0.52).abs() < 0.01 && (s[8] + 0.1).abs() < 0.01;
+            for action in chunk.iter_mut().filter(|_| there) {
+                action[..3].copy_from_slice(&[0.52, -0.10, 0.10]);
+                action[7] = 1.0;
+            }
+        }
+        Ok(chunks)
+    }
+}
+
+#[test]
+fn an_object_that_is_let_go_of_in_the_air_is_brought_down_first() {
+    let explore = |lower| ExploreConfig {
+        enabled: true,
+        sideways_m: 0.0,
+        up_m: 0.0,
+        yaw_rad: 0.0,
+        lower,
+        ..ExploreConfig::default()
+    };
+    // By how much objects come down between the last row in which they are held and the next but one, m.
+    let falls = |lower: bool| -> Vec<f32> {
+        let all = collected_by(&Drop, 1, explore(lower), 2);
+        let episodes = all.easy.iter().chain(&all.rejected);
+        let fall = |e: &e2h_core::Episode| {
+            let t = (1..e.len()).find(|&t| e.state[t - 1][14] < 0.06 && e.state[t][14] >= 0.06)?;
+            Some(e.state[t - 1][9] - e.state[(t + 3).min(e.len() - 1)][9])
+        };
+        episodes.filter_map(fall).collect()
+    };
+    let (dropped, lowered) = (falls(false), falls(true));
+    assert!(dropped.len() > 2 && dropped.iter().all(|z| *z > 0.03), "{dropped:?}");
+    assert!(lowered.len() > 2 && lowered.iter().all(|z| *z < 0.004), "{lowered:?}");
 }
 
 #[test]

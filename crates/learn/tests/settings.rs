@@ -209,6 +209,8 @@ const CHANGES: &[Change] = &[
     ("loop.explore.ramp_m", Err(EXPLORE)),
     ("loop.explore.release", Err(EXPLORE)),
     ("loop.explore.grip_m", Err(EXPLORE)),
+    ("loop.explore.turn", Err(EXPLORE)),
+    ("loop.explore.lower", Err(EXPLORE)),
     ("loop.explore.growth", Err(EXPLORE)),
     ("policy.n_obs_steps", Ok((Train, "1"))),
     ("policy.n_image_steps", Ok((Train, "2"))),

@@ -41,13 +41,17 @@ pub struct GateConfig {
     /// A recording whose object moved further than this in the closed hand while it was carried is not accepted, m: backwards,
     /// it would have to slip by itself. 0 does not look.
     pub slip_m: f64,
+    /// An object that moved further than this before the hand held it is looked at from where it is held on alone, m: it had been
+    /// dropped or pushed, and the grasp of the reversal would be beside it. 0 does not look.
+    #[serde(default)]
+    pub loose_m: f64,
 }
 
 impl Default for GateConfig {
     fn default() -> Self {
         // Differs: the paper has no such gate; `enabled = false` is its rule. A recording that lets go and grasps again
         // replays backwards only by luck.
-        Self { enabled: true, closings: 1, openings: 1, slip_m: 0.0 }
+        Self { enabled: true, closings: 1, openings: 1, slip_m: 0.0, loose_m: 0.0 }
     }
 }
 
@@ -59,6 +63,7 @@ impl GateConfig {
         let mut problems: Vec<String> =
             counts.into_iter().filter_map(|(name, n)| limits::frames(name, n, 0)).collect();
         problems.extend(limits::amount("slip_m", self.slip_m, true));
+        problems.extend(limits::amount("loose_m", self.loose_m, true));
         // Between two closings there is an opening: other counts would accept nothing.
         if self.closings.abs_diff(self.openings) > 1 {
             problems.push(format!(
@@ -76,6 +81,26 @@ pub fn gate(episode: &Episode, config: &GateConfig, reverse: &ReverseConfig) -> 
     let switches = || gripper_switches(episode, reverse) == (config.closings, config.openings);
     let held = || config.slip_m == 0.0 || config.closings == 0 || slip(episode, reverse) <= config.slip_m;
     !config.enabled || (switches() && held())
+}
+
+/// Fingers that move less than this in a control step hold what they have, m.
+const HELD: f32 = 0.0005;
+
+/// The reversal from where the object is held on, where it moved further than [`GateConfig::loose_m`] before: in the recording it was
+/// dropped or pushed as the hand let go, which does not happen backwards. Others stay as they are.
+#[must_use]
+pub fn held_on(episode: Episode, config: &GateConfig, reverse: &ReverseConfig) -> Episode {
+    let open = open_states(&episode, reverse);
+    let Some(closes) = open.windows(2).position(|w| w[0] && !w[1]).filter(|_| config.loose_m > 0.0) else {
+        return episode;
+    };
+    let still = |t: &usize| (episode.opening(t + 1) - episode.opening(*t)).abs() < HELD;
+    let held = (closes + 1..episode.len().saturating_sub(1)).find(still).unwrap_or(closes + 1);
+    let moved = (0..=held).map(|t| (object(&episode, t) - object(&episode, 0)).norm()).fold(0.0, f64::max);
+    if moved <= config.loose_m {
+        return episode;
+    }
+    episode.select(&(held..episode.len()).collect::<Vec<_>>())
 }
 
 /// Object that moves less than this in a control step is not being carried, m.
@@ -144,6 +169,37 @@ mod tests {
         assert!(gate(&carried(0.002), &config, &reversal()) && !gate(&carried(0.005), &config, &reversal()));
         assert!(gate(&carried(0.005), &GateConfig::default(), &reversal()));
         assert_eq!(slip(&along(&[]), &reversal()), 0.0);
+    }
+
+    /// A hand that closes at the sixth row round an object that was beside it by `off` m two rows before.
+    fn grasped(off: f32) -> Episode {
+        let mut e = along(&(0..14).map(|t| 0.01 * f64::from(t)).collect::<Vec<_>>());
+        for (t, s) in e.state.iter_mut().enumerate() {
+            s[14] = if t < 5 {
+                0.08
+            } else if t == 5 {
+                0.05
+            } else {
+                0.03
+            };
+            (s[7], s[8], s[9]) = (0.5 + if t < 4 { off } else { 0.0 }, 0.0, 0.01);
+        }
+        e
+    }
+
+    #[test]
+    fn a_reversal_of_a_drop_begins_where_the_object_is_held() {
+        let config = GateConfig { loose_m: 0.003, ..GateConfig::default() };
+        let cut = |off: f32, config: &GateConfig| held_on(grasped(off), config, &reversal());
+        assert_eq!(cut(0.002, &config), grasped(0.002));
+        assert_eq!(cut(0.01, &GateConfig::default()), grasped(0.01));
+        let held = cut(0.01, &config);
+        assert_eq!(held.state, grasped(0.01).state[6..]);
+        assert!(held.terminal == grasped(0.01).terminal);
+        // Nothing is grasped, or at the very end.
+        assert_eq!(held_on(along(&[]), &config, &reversal()), along(&[]));
+        let last = grasped(0.01).select(&[0, 1, 2, 3, 4, 5]);
+        assert!(held_on(last, &config, &reversal()).len() <= 1);
     }
 
     #[test]

@@ -49,7 +49,7 @@ pub use dynamics::{DynamicsFilterConfig, dynamics_filter};
 pub use error::{Error, Result};
 pub use fate::{Fate, RefineReport, Refined, merge_fates};
 pub use goal::{Goal, GoalConfig};
-pub use gripper::{GateConfig, gate, gripper_switches, slip};
+pub use gripper::{GateConfig, gate, gripper_switches, held_on, slip};
 pub use kinematic::{KinematicConfig, kinematic_filter};
 pub use resample::resample;
 pub use reverse::{Labels, ReverseConfig, rebuild_actions, reverse};

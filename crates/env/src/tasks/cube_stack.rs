@@ -124,6 +124,10 @@ impl Task for CubeStack {
         }
     }
 
+    fn put_down_turn(&self) -> f64 {
+        FRAC_PI_4
+    }
+
     fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
         START.nearest(p)
     }

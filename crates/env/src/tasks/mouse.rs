@@ -110,6 +110,10 @@ impl Task for Mouse {
         }
     }
 
+    fn put_down_turn(&self) -> f64 {
+        START_YAW
+    }
+
     fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {
         START.nearest(p)
     }

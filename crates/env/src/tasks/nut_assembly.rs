@@ -11,7 +11,7 @@ use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, T
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::Rng as _;
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::sync::Arc;
 use variant::{NUT_HALF_HEIGHT, PEG_TOP, VARIANTS, Variant, Yaw};
 
@@ -143,6 +143,13 @@ impl Task for NutAssembly {
         let p = sim.object().position;
         let over = p.z - NUT_HALF_HEIGHT - PEG_TOP;
         over.max((p.xy() - Vector2::from(self.variant.peg)).norm() - self.variant.reach())
+    }
+
+    fn put_down_turn(&self) -> f64 {
+        match self.variant.yaw {
+            Yaw::Fixed => 0.0,
+            Yaw::Uniform | Yaw::Quarters => FRAC_PI_2,
+        }
     }
 
     fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {

@@ -1,7 +1,7 @@
 use crate::Result;
 use crate::method::{Lesson, Method, Round, Tools};
 use e2h_core::Episode;
-use e2h_refine::{Goal, Refined, critic_filter, gate, kinematic_filter, reverse};
+use e2h_refine::{Goal, Refined, critic_filter, gate, held_on, kinematic_filter, reverse};
 use std::time::Instant;
 
 /// Auto-E2H: easy rollouts, turned round and filtered, teach the hard policy.
@@ -30,12 +30,28 @@ pub fn candidates(round: &Round<'_>, reversed: Vec<Episode>, notes: &mut Vec<Str
     let r = &round.config.refine;
     let mut candidates: Vec<Episode> =
         reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
+    let mut loose = 0;
     if let Some(goal) = Goal::fit(&round.demonstrations.hard, &r.goal) {
         let before = candidates.len();
         if r.goal.enabled {
             candidates.retain(|e| goal.accepts(e));
         }
         notes.push(goal_note(&goal, &round.rollouts.hard, candidates.len(), before));
+    }
+    if r.gate.loose_m > 0.0 {
+        let all = candidates.len();
+        candidates = candidates
+            .into_iter()
+            .map(|e| {
+                let before = e.len();
+                let e = held_on(e, &r.gate, &r.reverse);
+                loose += usize::from(e.len() < before);
+                e
+            })
+            .collect();
+        notes.push(format!(
+            "release: {loose} of {all} reversals begin in the hand, as the object was dropped or pushed"
+        ));
     }
     candidates
 }

@@ -2,7 +2,9 @@
 
 use crate::builder::{Builder, Mode, Order, Shapes, Shared};
 use crate::compute::{Backend, Compute};
+use crate::graph;
 use crate::kernel::conv::in_panels;
+use crate::kernel::optim::blend;
 use crate::numbers::Numbers;
 use crate::storage::{edit, host, with};
 use crate::weights::{HostTensor, Weights};
@@ -191,6 +193,34 @@ impl Params {
             } else {
                 edit(&param.var, |p| p.copy_from_slice(&data))?;
             }
+        }
+        Ok(())
+    }
+
+    /// Moves the parameters towards those of `other`: `p += part (other - p)`. A part of 1 copies them to the last bit. For target networks.
+    ///
+    /// # Errors
+    /// [`Error::OtherParams`] when `other` is of another network or elsewhere; nothing has changed then.
+    pub fn follow(&self, other: &Self, part: f32) -> Result<()> {
+        let same = |(a, b): (&Param, &Param)| a.shape == b.shape && a.order == b.order && a.cut == b.cut;
+        let alike = self.len() == other.len() && self.params.values().zip(other.params.values()).all(same);
+        if !alike || self.backend != other.backend {
+            let (expected, found) = (self.len(), other.len());
+            return Err(Error::OtherParams { what: "parameters to follow", expected, found });
+        }
+        for (ours, theirs) in self.variables().zip(other.variables()) {
+            if self.backend == Backend::Candle {
+                let theirs = theirs.as_detached_tensor();
+                let moved = if part < 1.0 {
+                    graph::optim::blend(&ours.as_detached_tensor(), &theirs, part)?
+                } else {
+                    theirs.force_contiguous()?
+                };
+                ours.set(&moved)?;
+                continue;
+            }
+            let theirs = with(theirs.as_tensor(), <[f32]>::to_vec)?;
+            edit(ours, |p| if part < 1.0 { blend(p, &theirs, part) } else { p.copy_from_slice(&theirs) })?;
         }
         Ok(())
     }

@@ -34,6 +34,7 @@ mod folder;
 pub mod lerobot;
 mod model;
 mod policy;
+pub mod sac;
 mod train;
 mod train_config;
 

@@ -259,8 +259,8 @@ fn measure(
     let folder = job.folder(&a.out).join(format!("iteration_{iteration:02}/policy"));
     let published = Published::open(&folder)?;
     let envs = published.envs(published.config.evaluation.parallel.min(trials.len()))?;
-    let policy = &published.policy;
-    Ok(evaluate(envs, policy, Direction::Hard, trials, a.evaluation_seed, None, progress)?.evaluation)
+    Ok(evaluate(envs, published.policy(), Direction::Hard, trials, a.evaluation_seed, None, progress)?
+        .evaluation)
 }
 
 /// Trials that are added at once, where a test has not decided.

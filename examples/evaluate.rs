@@ -58,12 +58,12 @@ fn program() -> anyhow::Result<()> {
     if let Some(n) = a.threads {
         auto_e2h::learn::set_threads(n)?;
     }
-    let mut published = Published::open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
+    let published = Published::open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
     let compute = Compute::open(&a.device, published.config.device)?;
-    published.policy = published.policy.into_device(&compute)?;
+    let published = published.into_device(&compute)?;
     let parallel = published.config.evaluation.parallel.min(a.trials);
     let progress = Progress::new(a.json);
-    let (policy, direction) = (&published.policy, published.direction);
+    let (policy, direction) = (published.policy(), published.direction);
     let filming = Filming { trials: Filmed::FailuresFirst(a.filmed), camera: "table".to_owned(), size: 200 };
     let filming = a.video.is_some().then_some(&filming);
     let envs = published.envs(parallel)?;
@@ -74,7 +74,7 @@ fn program() -> anyhow::Result<()> {
         report::animation::write_apng(path, &report::animation::tile(&frames, &outcomes, 3), 10)?;
     }
 
-    let task = &published.checkpoint.provenance.task;
+    let task = &published.provenance.task;
     if a.json {
         let line = serde_json::json!({
             "task": task,

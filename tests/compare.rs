@@ -8,9 +8,14 @@ use std::time::Duration;
 /// Long enough for the demonstrator of the hard task.
 const LONG: &str = "--set=env.horizon_hard=400";
 
-/// A comparison of every method on two pairs.
+/// The methods that run on every pair.
+fn everywhere() -> Vec<&'static str> {
+    methods::registry().iter().map(|m| m.name).filter(|n| *n != "tr-drl").collect()
+}
+
+/// A comparison of every one of them on two pairs.
 fn compare(out: &Path, arguments: &[&str]) -> Command {
-    let names: Vec<&str> = methods::registry().iter().map(|m| m.name).collect();
+    let names = everywhere();
     let mut command = example("compare");
     command.args(["--tasks", "nut_assembly,disk", "--methods", &names.join(","), "--seeds", "0"]);
     command.args(["--preset", "smoke", "--trials", "4", "--quiet", "--out"]).arg(out);
@@ -30,7 +35,7 @@ fn done(out: &Path) -> usize {
 fn all_methods_on_two_pairs_stopped_sharded_and_merged() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("compare");
-    let all = 2 * methods::registry().len();
+    let all = 2 * everywhere().len();
 
     // Asked to stop, it stops its runs, which save what they have.
     let mut child = compare(&out, &[]).stderr(Stdio::piped()).spawn().unwrap();
@@ -53,10 +58,10 @@ fn all_methods_on_two_pairs_stopped_sharded_and_merged() {
 
     let json = std::fs::read_to_string(out.join("compare.json")).unwrap();
     let comparison: Comparison = serde_json::from_str(&json).unwrap();
-    assert_eq!(comparison.methods().len(), methods::registry().len());
+    assert_eq!(comparison.methods().len(), everywhere().len());
     assert_eq!(comparison.reference, "auto-e2h");
     assert!(comparison.runs.iter().all(|r| r.last.outcomes.len() == 4 && r.initial.trials == 4));
-    for name in methods::registry().iter().map(|m| m.name).filter(|n| *n != "auto-e2h") {
+    for name in everywhere().into_iter().filter(|n| *n != "auto-e2h") {
         for column in ["compare.html", "iterations.csv", "trials.csv"] {
             assert!(std::fs::read_to_string(out.join(column)).unwrap().contains(name), "{column}: {name}");
         }
@@ -129,6 +134,7 @@ fn what_cannot_run_is_said_before_any_work() {
     };
     refused(&["--tasks", "nut_asembly"], "did you mean `nut_assembly`");
     refused(&["--tasks", "disk", "--methods", "auto-e2h,direkt-h"], "did you mean `direct-h`");
+    refused(&["--tasks", "nut_assembly,disk", "--methods", "auto-e2h,tr-drl"], "found disk");
     refused(&["--tasks", "disk", "--preset", "smok"], "did you mean `smoke`");
     refused(&["--tasks", "disk", "--set", "loop.cycels=3"], "loop.cycles");
     refused(&["--tasks", "disk,disk"], "named twice");
@@ -138,4 +144,28 @@ fn what_cannot_run_is_said_before_any_work() {
     std::fs::write(dir.path().join("mine.txt"), "x").unwrap();
     let output = example("compare").args(["--tasks", "disk", "--out"]).arg(dir.path()).output().unwrap();
     assert!(!output.status.success() && text(&output.stderr).contains("another folder"));
+}
+
+#[test]
+fn agents_from_states_are_compared_like_any_other_method() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("compare");
+    let mut command = example("compare");
+    command.args([
+        "--tasks",
+        "nut_assembly",
+        "--methods",
+        "auto-e2h,tr-drl",
+        "--seeds",
+        "0",
+        "--preset",
+        "smoke",
+    ]);
+    command.args(["--trials", "4", "--quiet", "--set=loop.iterations=1", "--out"]).arg(&out).args(SMALL);
+    assert_success(&command.output().unwrap());
+    let json = std::fs::read_to_string(out.join("compare.json")).unwrap();
+    let comparison: Comparison = serde_json::from_str(&json).unwrap();
+    assert_eq!(comparison.methods(), ["auto-e2h", "tr-drl"]);
+    assert!(comparison.runs.iter().all(|r| r.last.outcomes.len() == 4 && r.initial.trials == 4));
+    assert!(std::fs::read_to_string(out.join("compare.html")).unwrap().contains("tr-drl"));
 }

@@ -14,7 +14,9 @@ pub(crate) type Learned = (RunResults, PathBuf);
 /// Learns a pair with what the command line asks for, and tells how it went. SIGINT and SIGTERM end it with its state saved, and
 /// with status 130 and 143.
 pub(crate) fn main(task: &str, parts: Parts, learn: fn(&Run) -> Result<Learned>) -> ExitCode {
-    let done = options(task).and_then(|o| Run::open_with(&o, &parts)).and_then(|run| learn(&run));
+    let done = options(task)
+        .and_then(|o| Run::open_with(&o, &parts))
+        .and_then(|run| run.learn_alone().unwrap_or_else(|| learn(&run)));
     let told = match done {
         Ok((results, page)) => say(report::table::iterations(&results))
             .and_then(|()| say(format_args!("report: {}", page.display())))

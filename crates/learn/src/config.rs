@@ -4,7 +4,7 @@ mod layers;
 mod validate;
 
 use crate::methods::{DynamicsStage, RecapConfig};
-use crate::{Error, ExploreConfig, Result};
+use crate::{Error, ExploreConfig, Result, TrDrlConfig};
 use e2h_env::{DemonstratorConfig, EnvConfig, Task, TaskOptions};
 use e2h_nn::Precision;
 use e2h_policy::{CriticConfig, PolicyConfig, TrainConfig};
@@ -46,6 +46,9 @@ pub struct RunConfig {
     /// The method `tr-drl-dp`, likewise.
     #[serde(default, skip_serializing_if = "is_default")]
     pub dynamics: DynamicsStage,
+    /// The method `tr-drl`, likewise.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub tr_drl: TrDrlConfig,
     /// Measuring success.
     pub evaluation: EvaluationConfig,
     /// How exact a GPU multiplies; without effect on the CPU. Checkpoints from before it have none.
@@ -304,6 +307,7 @@ impl RunConfig {
         t.step.indicator_dropout = mine.step.indicator_dropout;
         same.recap = self.recap.clone();
         same.dynamics = self.dynamics.clone();
+        same.tr_drl = self.tr_drl.clone();
         let (r, mine) = (&mut same.refine, &self.refine);
         r.kinematic_enabled = mine.kinematic_enabled;
         (r.gate, r.goal) = (mine.gate.clone(), mine.goal.clone());

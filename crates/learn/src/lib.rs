@@ -30,6 +30,7 @@ mod published;
 mod rollout;
 mod run;
 mod stop;
+mod tr_drl;
 
 pub(crate) use e2h_report::picture;
 pub use e2h_report::{self as report, record, tensorboard, view};
@@ -40,8 +41,9 @@ pub use error::{Error, Result};
 pub use evaluate::{Evaluated, Filmed, Filming, evaluate};
 pub use explore::ExploreConfig;
 pub use method::{Lesson, Method, Round, Tools};
-pub use policy_class::{Diffusion, Job, PolicyClass, Trained, Training};
+pub use policy_class::{Diffusion, Job, PolicyClass, States, Trained, Training};
 pub use progress::{Bar, Progress};
 pub use published::Published;
 pub use run::{Accepted, BuildTask, Demonstrations, Json, Parts, Run, RunOptions, Stored, set_threads};
 pub use stop::Stop;
+pub use tr_drl::{Demonstrated, Reward, TrDrlConfig};

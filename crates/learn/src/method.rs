@@ -8,12 +8,15 @@
 //! ```
 
 use crate::collect::Collected;
+use crate::policy_class::PolicyClass;
+use crate::record::RunResults;
 use crate::run::Toolbox;
-use crate::{Demonstrations, Result, RunConfig, Trained};
+use crate::{Demonstrations, Result, Run, RunConfig, Trained};
 use e2h_core::{Direction, Episode};
 use e2h_data::Source;
 use e2h_policy::{Critic, CriticReport, Dynamics, DynamicsReport};
 use e2h_refine::Refined;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -85,6 +88,26 @@ impl<'a> Tools<'a> {
 pub trait Method: Send + Sync {
     /// Its name, for example `auto-e2h`.
     fn name(&self) -> &str;
+
+    /// Refuses what it cannot run on, before any work; by default nothing.
+    ///
+    /// # Errors
+    /// Says what was expected and found.
+    fn check(&self, config: &RunConfig) -> Result<()> {
+        let _ = config;
+        Ok(())
+    }
+
+    /// The class of policies that it trains, where it is not the run's choice.
+    fn policies(&self) -> Option<Arc<dyn PolicyClass>> {
+        None
+    }
+
+    /// All of the run, for a method whose loop is not the shared one; by default none.
+    fn learn(&self, run: &Run) -> Option<Result<(RunResults, PathBuf)>> {
+        let _ = run;
+        None
+    }
 
     /// What the initial hard policy learns from; by default the reversed demonstrations.
     ///

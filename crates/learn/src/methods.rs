@@ -4,6 +4,7 @@ mod auto_e2h;
 mod direct_h;
 mod hard_demos;
 mod recap;
+mod tr_drl;
 mod tr_drl_dp;
 
 use crate::{Error, Method, Result};
@@ -14,6 +15,7 @@ pub use auto_e2h::{AutoE2h, candidates, filter};
 pub use direct_h::DirectH;
 pub use hard_demos::HardDemos;
 pub use recap::{Indicator, Recap, RecapConfig};
+pub use tr_drl::TrDrl;
 pub use tr_drl_dp::{DynamicsStage, TrDrlDp};
 
 /// A method as it is chosen: code, and values laid over preset and task file.
@@ -45,12 +47,13 @@ pub fn registry() -> &'static [Entry] {
         "direct-h",
         "hard-demos",
         "recap",
-        "tr-drl-dp"
+        "tr-drl-dp",
+        "tr-drl"
     ]
 }
 
 /// Names of the code that a method file can ask for.
-const CODE: [&str; 5] = ["auto-e2h", "direct-h", "hard-demos", "recap", "tr-drl-dp"];
+const CODE: [&str; 6] = ["auto-e2h", "direct-h", "hard-demos", "recap", "tr-drl-dp", "tr-drl"];
 
 fn code(name: &str) -> Option<Arc<dyn Method>> {
     match name {
@@ -59,6 +62,7 @@ fn code(name: &str) -> Option<Arc<dyn Method>> {
         "hard-demos" => Some(Arc::new(HardDemos)),
         "recap" => Some(Arc::new(Recap)),
         "tr-drl-dp" => Some(Arc::new(TrDrlDp)),
+        "tr-drl" => Some(Arc::new(TrDrl)),
         _ => None,
     }
 }
@@ -85,7 +89,7 @@ impl Entry {
 
 /// Whether the hard policy of a method begins with the reversed demonstrations and nothing else; false for one that is not built in.
 pub(crate) fn begins_with_reversals(name: &str) -> bool {
-    name != "hard-demos" && registry().iter().any(|m| m.name == name)
+    !["hard-demos", "tr-drl"].contains(&name) && registry().iter().any(|m| m.name == name)
 }
 
 /// A method by name.

@@ -7,6 +7,7 @@ use crate::{Error, Result, RunConfig};
 use e2h_core::Policy;
 use e2h_data::{Normaliser, Source};
 use e2h_nn::{Compute, Weights};
+use e2h_policy::sac::{self, StatePolicy};
 use e2h_policy::{DiffusionPolicy, PolicyConfig, Provenance, Trainer, TrainingData};
 use std::path::Path;
 
@@ -145,6 +146,34 @@ impl Training for DiffusionTraining<'_> {
         let weights = self.trainer.weights()?;
         let policy = DiffusionPolicy::with_weights(&self.policy, self.job.normaliser, &weights)?;
         Ok(Box::new(policy.into_device(self.job.compute)?))
+    }
+}
+
+/// Actors of the method `tr-drl`: policies from states alone, which that method trains by itself.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct States;
+
+impl Trained for StatePolicy {
+    fn weights(&self) -> Result<Weights> {
+        Ok(StatePolicy::weights(self)?)
+    }
+
+    fn save(&self, folder: &Path, provenance: &Provenance) -> Result<()> {
+        Ok(StatePolicy::save(self, folder, provenance)?)
+    }
+}
+
+impl PolicyClass for States {
+    fn name(&self) -> &str {
+        sac::KIND
+    }
+
+    fn train<'a>(&self, _: Job<'a>) -> Result<Box<dyn Training + 'a>> {
+        Err(Error::Config(format!("policies `{}`: expected the method tr-drl, which trains them", sac::KIND)))
+    }
+
+    fn load(&self, folder: &Path, _: &Compute) -> Result<Box<dyn Trained>> {
+        Ok(Box::new(StatePolicy::load(folder)?.0))
     }
 }
 

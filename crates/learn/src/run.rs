@@ -8,6 +8,7 @@ mod options;
 mod round;
 mod share;
 mod stage;
+mod tr_drl;
 mod train;
 
 use crate::config::{Resolved, RunConfig};
@@ -80,6 +81,7 @@ impl Run {
         e2h_nn::tune_allocator();
         let entry = methods::find(&options.method)?;
         let (code, values) = entry.read()?;
+        let method = parts.method.clone().unwrap_or(code);
         let own = parts.task.as_ref();
         let text = own.map(|(text, _)| text.as_str());
         let mut resolved =
@@ -98,12 +100,13 @@ impl Run {
         }
         resolved.config.know(&*task);
         let config = &resolved.config;
+        method.check(config)?;
         let compute = Compute::open(&options.device, config.device)?;
         let mut env = Env::new(task.clone(), &config.env)?;
         if !config.policy.cameras.is_empty() {
             env.select_cameras(&config.policy.cameras)?;
         }
-        let class = parts.policy.clone().unwrap_or_else(|| Arc::new(Diffusion));
+        let class = method.policies().or_else(|| parts.policy.clone()).unwrap_or_else(|| Arc::new(Diffusion));
         let identity = Identity {
             format: LAYOUT,
             task: options.task.clone(),
@@ -122,7 +125,7 @@ impl Run {
             progress,
             compute,
             task,
-            method: parts.method.clone().unwrap_or(code),
+            method,
             class,
             identity,
             env,
@@ -178,6 +181,9 @@ impl Run {
     /// # Errors
     /// Those of the stages.
     pub fn learn(&self) -> Result<(RunResults, PathBuf)> {
+        if let Some(done) = self.learn_alone() {
+            return done;
+        }
         let demonstrations = self.demonstrations()?;
         let mut easy = self.train_easy(&demonstrations)?;
         let mut hard = self.train_initial(&demonstrations)?;
@@ -190,6 +196,12 @@ impl Run {
             records.push(self.evaluate(n, &*hard, rounds.last())?);
         }
         self.report(&demonstrations, records)
+    }
+
+    /// All of it, where the method has a loop of its own ([`Method::learn`]).
+    #[must_use]
+    pub fn learn_alone(&self) -> Option<Result<(RunResults, PathBuf)>> {
+        self.method.learn(self)
     }
 
     /// Records the easy demonstrations and reverses them into `D_h^(0)`.

@@ -161,6 +161,7 @@ const BASE: &[&str] = &[
 const EXPLORE: &str = "policies of no training never move the object; tests/explore.rs has one that does";
 
 const RECAP: &str = "of the method recap alone; tests/pipeline.rs has what it changes there";
+const TR_DRL: &str = "of the method tr-drl alone; tests/tr_drl.rs has what each changes there";
 /// Of the method `tr-drl-dp` alone.
 const DYNAMICS: &str = "of the method tr-drl-dp alone; tests/pipeline.rs has what each changes there";
 
@@ -326,6 +327,25 @@ const CHANGES: &[Change] = &[
     ("dynamics.filter.smooth", Err(DYNAMICS)),
     ("dynamics.filter.percentile", Err(DYNAMICS)),
     ("dynamics.filter.min_run", Err(DYNAMICS)),
+    ("tr_drl.demonstrations", Err(TR_DRL)),
+    ("tr_drl.reward", Err(TR_DRL)),
+    ("tr_drl.episodes", Err(TR_DRL)),
+    ("tr_drl.random_episodes", Err(TR_DRL)),
+    ("tr_drl.batch", Err(TR_DRL)),
+    ("tr_drl.tolerance", Err(TR_DRL)),
+    ("tr_drl.shaping", Err(TR_DRL)),
+    ("tr_drl.shaping_limit", Err(TR_DRL)),
+    ("tr_drl.potential_steps", Err(TR_DRL)),
+    ("tr_drl.potential_more_steps", Err(TR_DRL)),
+    ("tr_drl.agent.hidden", Err(TR_DRL)),
+    ("tr_drl.agent.layer_norm", Err(TR_DRL)),
+    ("tr_drl.agent.entropy_in_target", Err(TR_DRL)),
+    ("tr_drl.agent.gamma", Err(TR_DRL)),
+    ("tr_drl.agent.tau", Err(TR_DRL)),
+    ("tr_drl.agent.lr", Err(TR_DRL)),
+    ("tr_drl.agent.alpha", Err(TR_DRL)),
+    ("tr_drl.agent.actor_every", Err(TR_DRL)),
+    ("tr_drl.agent.restart_above", Err(TR_DRL)),
     ("evaluation.trials", Ok((Evaluate, "2"))),
     ("evaluation.seed", Ok((Evaluate, "7"))),
     ("evaluation.parallel", Err("how many trials the policy answers at once: changes last bits alone")),

@@ -117,6 +117,7 @@ impl RunConfig {
         });
         all.of("dynamics.network", self.dynamics.network.validate());
         all.of("dynamics.filter", self.dynamics.filter.validate());
+        all.of("tr_drl", self.tr_drl.validate());
         all.of("critic.network", self.critic.network.validate(p));
         for camera in p.cameras.iter().filter(|c| !CAMERAS.contains(&c.as_str())) {
             all.0.push(format!(

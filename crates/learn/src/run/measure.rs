@@ -66,6 +66,7 @@ impl Run {
         if let Some(accepted) = accepted {
             stage_minutes.extend(accepted.stage_minutes.clone());
         }
+        let updates = trained.as_ref().map_or(0, |t| t.steps);
         let before = if iteration == 0 {
             0.0
         } else {
@@ -79,8 +80,8 @@ impl Run {
             stage_minutes,
             collection: accepted.map(|a| a.collection.clone()),
             loss: trained.as_ref().map_or(0.0, |t| t.loss),
-            skipped: accepted.is_some_and(|a| a.segments.is_empty()),
-            updates: trained.as_ref().map_or(0, |t| t.steps),
+            skipped: accepted.is_some_and(|a| a.segments.is_empty()) && updates == 0,
+            updates,
         };
         let files = self.dir.seals(&[folder(iteration, "rollouts.png")])?;
         let measured = Measured { record, files };

@@ -67,10 +67,13 @@ impl RunOptions {
     /// The configuration that a run of a built-in pair has with these options: preset, task file, method and overrides.
     ///
     /// # Errors
-    /// An unknown task, preset, method or key (the nearest known one is named), values that do not fit together.
+    /// An unknown task, preset, method or key (the nearest known one is named), values that do not fit together, a pair that the method
+    /// cannot run on.
     pub fn resolve(&self) -> Result<Resolved> {
-        let (_, values) = methods::find(&self.method)?.read()?;
-        RunConfig::resolve_with(&self.preset, &self.task, None, &values, &self.set)
+        let (method, values) = methods::find(&self.method)?.read()?;
+        let resolved = RunConfig::resolve_with(&self.preset, &self.task, None, &values, &self.set)?;
+        method.check(&resolved.config)?;
+        Ok(resolved)
     }
 }
 

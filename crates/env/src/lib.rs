@@ -42,7 +42,7 @@ pub use record::{demonstrate, replay};
 pub use render::{MOST_PIXELS, Style};
 pub use scene::{TableCamera, compose, finer};
 pub use sim::{MAX_OPENING, Sim};
-pub use task::{Task, Turns};
+pub use task::Task;
 pub use tasks::*;
 
 /// What pick-and-place pairs are made of: regions and pieces of predicates, grasps, and the one script of their demonstrators.

@@ -3,15 +3,6 @@ use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
 
-/// How far a hand may turn, rad to either side.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Turns {
-    /// From the home pose.
-    pub from_home: f64,
-    /// From how it held the object at its goal: to where the hard task would rather turn the other way, or not at all.
-    pub from_goal: f64,
-}
-
 /// A pair of tasks that undo each other, in one scene.
 ///
 /// Everything a task needs to know it is told: there is no hidden state, so one task serves any number of environments.
@@ -78,10 +69,11 @@ pub trait Task: Send + Sync {
         *p
     }
 
-    /// The turns with which the hand may put the object down at the end of the easy task: where the hard task's objects start with any yaw, those
-    /// that grasp them. By default, for pairs whose objects start one way or may be grasped any way: none.
-    fn put_down_turns(&self) -> Turns {
-        Turns { from_home: 0.0, from_goal: 0.0 }
+    /// Up to which turn from the home pose, rad to either side, the hand may put the object down at the end of the easy task: where
+    /// the hard task's objects start with any yaw, all the turns that grasp them. By default, for pairs whose objects start one
+    /// way or may be grasped any way: 0.
+    fn put_down_turn(&self) -> f64 {
+        0.0
     }
 
     /// Whether the object has to be held throughout: dropping it then ends the episode.

@@ -35,10 +35,8 @@ const LEAVES: (f64, f64) = (0.03, 0.10);
 const LOWER_M: f64 = 0.004;
 /// Object that comes down less than this in such a step lies on something, m.
 const LIES_M: f64 = 0.001;
-/// Most steps down, steps in which the hand then stays where it is and opens, and steps back along the way that it points.
-const LOWERING: [usize; 3] = [50, 5, 10];
-/// How far the hand draws back in each of these, m.
-const BACK_M: f64 = 0.006;
+/// Most steps down, and steps in which the hand then stays where it is and opens.
+const LOWERING: (usize, usize) = (50, 5);
 
 /// How collection explores.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -67,7 +65,7 @@ pub struct ExploreConfig {
     /// hold the object throughout.
     #[serde(default)]
     pub grip_m: f64,
-    /// How much of the turns at which the object may be put down ([`e2h_env::Task::put_down_turns`]) is used, in [0, 1]: a rollout
+    /// How much of the turns at which the object may be put down ([`e2h_env::Task::put_down_turn`]) is used, in [0, 1]: a rollout
     /// draws its own turn evenly from them, the hand takes it once the object is clear, and keeps it until it leaves the object.
     /// Reversed, the object is grasped at a turn that no demonstration may have shown, and turned back on the way. 0: the policy
     /// chooses.
@@ -153,16 +151,6 @@ impl ExploreConfig {
 /// Amplitude, frequency (Hz) and phase (rad) of one sinusoid.
 type Wave = (f64, f64, f64);
 
-/// What comes before an action of the policy.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Before {
-    Nothing,
-    /// This first.
-    Do(Action),
-    /// It is no longer what the policy would want.
-    AskAnew,
-}
-
 /// What is done where a policy lets go.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Lowering {
@@ -170,9 +158,8 @@ enum Lowering {
     Waits,
     /// Steps down so far, height of the object before the last of them, and steps in which it did not come down.
     Down(usize, f64, usize),
+    /// Steps in which the hand stays and opens.
     Opens(usize),
-    /// Steps in which it draws back.
-    Back(usize),
     Over,
 }
 
@@ -183,10 +170,8 @@ pub(crate) struct Wander {
     release: f64,
     /// Place of the grip along the jaws, m.
     grip: f64,
-    /// Where in the range of turns with which the object may be put down, from -1 to 1; None: as the policy wants.
+    /// Turn from home at which the object is put down, as a share of the task's largest; None: as the policy wants.
     turn: Option<f64>,
-    /// The hand's turn from home when it last held the object at its goal, rad.
-    at_goal: f64,
     /// How much of the way from the policy's turn to that one is gone, in [0, 1].
     turned: f64,
     /// Of x, y, z (m) and yaw (rad).
@@ -226,7 +211,6 @@ impl Wander {
             release: config.release,
             grip,
             turn: (config.turn > 0.0).then_some(turn),
-            at_goal: 0.0,
             turned: 0.0,
             axes,
             clock: 0.0,
@@ -251,64 +235,51 @@ impl Wander {
         (env.sim().tcp().position - object.position - object.orientation * self.on_object).norm()
     }
 
-    /// What comes before `action`, which lets go of an object in the air: the hand goes down with it until it lies, opens, and draws back the way
-    /// that it points. Then the policy has to be asked anew: what it wanted next it wanted elsewhere.
-    pub(crate) fn before(&mut self, env: &Env, action: &Action) -> Before {
+    /// What to do before `action`, which lets go of an object in the air: another step down, or, where it lies, one in which the hand stays
+    /// and opens. None: the action itself.
+    pub(crate) fn before(&mut self, env: &Env, action: &Action) -> Option<Action> {
         let sim = env.sim();
         let height = sim.object().position.z;
         if self.lowering == Lowering::Waits {
             let lets_go = action[7] > 0.5 && !sim.opens() && sim.touching();
             if !lets_go || !env.task().homes() || env.task().room(sim) <= 0.0 {
-                return Before::Nothing;
+                return None;
             }
             self.lowering = Lowering::Down(0, f64::INFINITY, 0);
         }
-        let [down, opens, back] = LOWERING;
-        let mut goal = sim.goal();
-        self.lowering = match self.lowering {
-            Lowering::Waits | Lowering::Over => return Before::Nothing,
-            Lowering::Down(steps, before, lies) => {
-                let lies = if before - height < LIES_M { lies + 1 } else { 0 };
-                if steps < down && lies < 2 {
-                    goal.position.z -= LOWER_M;
-                    Lowering::Down(steps + 1, height, lies)
-                } else {
-                    // Not where the goal is by now, which is in the table.
-                    goal.position.z = sim.tcp().position.z;
-                    Lowering::Opens(1)
-                }
+        let (mut goal, mut open) = (sim.goal(), false);
+        if let Lowering::Down(steps, before, lies) = self.lowering {
+            let lies = if before - height < LIES_M { lies + 1 } else { 0 };
+            if steps < LOWERING.0 && lies < 2 {
+                goal.position.z -= LOWER_M;
+                self.lowering = Lowering::Down(steps + 1, height, lies);
+            } else {
+                self.lowering = Lowering::Opens(0);
             }
-            Lowering::Opens(steps) if steps < opens => Lowering::Opens(steps + 1),
-            Lowering::Opens(_) => {
-                goal.position -= goal.orientation * Vector3::z() * BACK_M;
-                Lowering::Back(1)
+        }
+        match self.lowering {
+            Lowering::Opens(steps) if steps < LOWERING.1 => {
+                // Not where the goal is by now, which is in the table.
+                goal.position.z = sim.tcp().position.z;
+                (self.lowering, open) = (Lowering::Opens(steps + 1), true);
             }
-            Lowering::Back(steps) if steps < back => {
-                goal.position -= goal.orientation * Vector3::z() * BACK_M;
-                Lowering::Back(steps + 1)
-            }
-            Lowering::Back(_) => {
-                self.lowering = Lowering::Over;
-                return Before::AskAnew;
-            }
-        };
+            Lowering::Opens(_) => self.lowering = Lowering::Over,
+            _ => {}
+        }
+        if matches!(self.lowering, Lowering::Over | Lowering::Waits) {
+            return None;
+        }
         let mut out = *action;
         out[..7].copy_from_slice(&goal.to_row(&[3, 4, 5, 6].map(|i| f64::from(action[i]))));
-        out[7] = f32::from(u8::from(!matches!(self.lowering, Lowering::Down(..))));
-        Before::Do(out)
+        out[7] = f32::from(u8::from(open));
+        Some(out)
     }
 
     /// The part of the excursion that brings the hand's turn from `goal`'s to that of this rollout, rad.
     fn turning(&mut self, env: &Env, goal: &Pose, free: f64, height: f64) -> f64 {
-        let (sim, turns) = (env.sim(), env.task().put_down_turns());
-        let Some(turn) = self.turn.filter(|_| turns.from_home > 0.0) else { return 0.0 };
-        let home = env.task().home();
-        if free == 0.0 {
-            self.at_goal = turn_from(&home, &sim.tcp());
-        }
-        let low = (self.at_goal - turns.from_goal).clamp(-turns.from_home, turns.from_home);
-        let high = (self.at_goal + turns.from_goal).clamp(-turns.from_home, turns.from_home);
-        let way = low + (high - low) * 0.5 * (1.0 + turn) - turn_from(&home, goal);
+        let (sim, largest) = (env.sim(), env.task().put_down_turn());
+        let Some(turn) = self.turn.filter(|_| largest > 0.0) else { return 0.0 };
+        let way = turn * largest - turn_from(&env.task().home(), goal);
         let (from, over) = LEAVES;
         let left = if sim.touching() { 0.0 } else { ((self.away(env) - from) / over).clamp(0.0, 1.0) };
         // An object that is being put down is no longer turned: it would rub on the table.

@@ -5,7 +5,7 @@
 //! threads nor their timing can change a result.
 
 use crate::Result;
-use crate::explore::{Before, Wander};
+use crate::explore::Wander;
 use e2h_core::{
     ACTION_DIM, Action, Direction, Episode, Excursion, Image, Observation, Origin, Outcome, Policy, Rng,
     stream,
@@ -95,15 +95,9 @@ impl Rollout {
             let seen = self.episode.is_some() || i + self.history.len() >= steps.len();
             let excursion = self.wander.as_ref().map(Wander::now);
             if let Some(asked) = asked {
-                loop {
-                    match self.wander.as_mut().map_or(Before::Nothing, |w| w.before(env, asked)) {
-                        Before::Nothing => break,
-                        Before::AskAnew => return Ok(None),
-                        Before::Do(extra) => {
-                            if let Some(done) = self.advance(env, &extra, excursion, true)? {
-                                return Ok(Some(done));
-                            }
-                        }
+                while let Some(extra) = self.wander.as_mut().and_then(|w| w.before(env, asked)) {
+                    if let Some(done) = self.advance(env, &extra, excursion, true)? {
+                        return Ok(Some(done));
                     }
                 }
             }

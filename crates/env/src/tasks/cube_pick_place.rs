@@ -4,10 +4,10 @@ use crate::expert::{draw, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place};
 use crate::tabletop::{Region, beside, left_alone, near_middle, tilt, turn};
 use crate::tasks::{Choice, Entry, STANDARD};
-use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, Turns, compose};
+use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
-use std::f64::consts::{FRAC_PI_4, PI};
+use std::f64::consts::FRAC_PI_4;
 use std::sync::Arc;
 
 /// Half an edge of the cube, m.
@@ -113,8 +113,8 @@ impl Task for CubePickPlace {
         }
     }
 
-    fn put_down_turns(&self) -> Turns {
-        Turns { from_home: FRAC_PI_4, from_goal: PI }
+    fn put_down_turn(&self) -> f64 {
+        FRAC_PI_4
     }
 
     fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {

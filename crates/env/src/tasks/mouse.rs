@@ -4,7 +4,7 @@ use crate::expert::{draw, gauss, scatter};
 use crate::pick_place::{Stand, Symmetry, Turn, down, from_above, ordered, pick_place, yaw_of};
 use crate::tabletop::{Region, beside, left_alone, near_middle, near_straight, tilt, turn};
 use crate::tasks::{Choice, Entry, STANDARD};
-use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, Turns, compose};
+use crate::{DemonstratorConfig, Expert, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::Vector3;
 use std::f64::consts::PI;
@@ -110,8 +110,8 @@ impl Task for Mouse {
         }
     }
 
-    fn put_down_turns(&self) -> Turns {
-        Turns { from_home: START_YAW, from_goal: PI }
+    fn put_down_turn(&self) -> f64 {
+        START_YAW
     }
 
     fn put_down(&self, p: &Vector3<f64>) -> Vector3<f64> {

@@ -7,11 +7,11 @@ use crate::expert::draw;
 use crate::pick_place::down;
 use crate::tabletop::Region;
 use crate::tasks::{Choice, Entry};
-use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, Turns, compose};
+use crate::{DemonstratorConfig, Expert, PosturePull, Result, Sim, TableCamera, Task, compose};
 use e2h_core::{Direction, Pose, Rng};
 use nalgebra::{UnitQuaternion, Vector2, Vector3};
 use rand::Rng as _;
-use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::sync::Arc;
 use variant::{NUT_HALF_HEIGHT, PEG_TOP, VARIANTS, Variant, Yaw};
 
@@ -145,13 +145,10 @@ impl Task for NutAssembly {
         over.max((p.xy() - Vector2::from(self.variant.peg)).norm() - self.variant.reach())
     }
 
-    fn put_down_turns(&self) -> Turns {
-        let turns = |from_goal| Turns { from_home: FRAC_PI_2, from_goal };
+    fn put_down_turn(&self) -> f64 {
         match self.variant.yaw {
-            Yaw::Fixed => Turns { from_home: 0.0, from_goal: 0.0 },
-            Yaw::Uniform => turns(PI),
-            // The hard task takes the nearest quarter turn; a tenth more, so that none is left out.
-            Yaw::Quarters => turns(1.1 * FRAC_PI_4),
+            Yaw::Fixed => 0.0,
+            Yaw::Uniform | Yaw::Quarters => FRAC_PI_2,
         }
     }
 

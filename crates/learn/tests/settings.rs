@@ -291,6 +291,7 @@ const CHANGES: &[Change] = &[
     ("refine.goal.least", Ok((Refine, "0.05"))),
     ("refine.gate.enabled", Ok((Refine, "false"))),
     ("refine.gate.slip_m", Ok((Refine, "0.000001"))),
+    ("refine.gate.loose_m", Ok((Refine, "1e-7"))),
     ("refine.advantage.gamma", Ok((Refine, "0.9"))),
     ("refine.advantage.lambda", Ok((Refine, "0.5"))),
     ("refine.advantage.smooth", Ok((Refine, "5"))),

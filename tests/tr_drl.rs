@@ -39,6 +39,8 @@ fn both_agents_learn_and_what_they_leave_is_a_run_like_any_other() {
     let last = &results.iterations[2];
     let collection = last.collection.as_ref().unwrap();
     assert_eq!((collection.cycles, collection.easy_rollouts), (2, 2));
+    // Nothing resets itself here.
+    assert_eq!((collection.resets.values().sum::<usize>(), collection.automatic_reset_rate()), (4, 0.0));
     // Two episodes of two directions; in the first of each no update.
     assert!(last.updates > 300 && !last.skipped, "{}", last.updates);
     assert!(collection.notes.iter().any(|n| n.contains("reversed transitions confirmed")));

@@ -117,6 +117,8 @@ pub enum ResetCause {
     Dropped,
     /// The easy rollout did not succeed.
     EasyFailed,
+    /// A method without a loop begins every episode with one.
+    Episode,
     /// The hard rollout did not succeed.
     HardFailed,
     /// The simulation diverged on the way home.
@@ -135,6 +137,7 @@ impl ResetCause {
             Self::Diverged => "diverged",
             Self::Dropped => "dropped",
             Self::EasyFailed => "easy failed",
+            Self::Episode => "episode",
             Self::HardFailed => "hard failed",
             Self::HomingDiverged => "homing diverged",
             Self::ResetDiverged => "reset diverged",

@@ -265,7 +265,7 @@ impl Run {
                 return Err(error.into());
             }
         }
-        *tally.resets.entry(ResetCause::Start).or_default() += 1;
+        *tally.resets.entry(ResetCause::Episode).or_default() += 1;
         let random = number < c.random_episodes;
         let adapter = agents.adapter(direction).clone();
         let trip = play(env, &adapter, direction, c.reward, |state| {

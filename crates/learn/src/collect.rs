@@ -85,7 +85,7 @@ pub fn collect(
         let explores = direction == Direction::Easy && config.explore.explores(cycle);
         let wander = explores.then(|| {
             let mut rng = stream(seed, "collect/explore", iteration, cycle as u64);
-            Wander::new(&config.explore, origin.iteration, &mut rng)
+            Wander::new(&config.explore, origin.iteration, lane.env.task().put_down_turn(), &mut rng)
         });
         lane.rollout = Some(rollout.wandering(wander));
         Ok(())

@@ -170,7 +170,7 @@ pub(crate) struct Wander {
     release: f64,
     /// Place of the grip along the jaws, m.
     grip: f64,
-    /// Turn from home at which the object is put down, as a share of the task's largest; None: as the policy wants.
+    /// Turn from home at which the object is put down, rad; None: as the policy wants.
     turn: Option<f64>,
     /// How much of the way from the policy's turn to that one is gone, in [0, 1].
     turned: f64,
@@ -191,8 +191,8 @@ pub(crate) struct Wander {
 }
 
 impl Wander {
-    /// Draws an excursion. All of its random numbers are drawn here.
-    pub(crate) fn new(config: &ExploreConfig, iteration: u32, rng: &mut Rng) -> Self {
+    /// Draws an excursion, its turn from `turns` to either side. All of its random numbers are drawn here.
+    pub(crate) fn new(config: &ExploreConfig, iteration: u32, turns: f64, rng: &mut Rng) -> Self {
         let growth = config.growth.powi(i32::try_from(iteration.saturating_sub(1)).unwrap_or(i32::MAX));
         let sigmas = [config.sideways_m, config.sideways_m, config.up_m, config.yaw_rad];
         let [low, high] = config.band_hz;
@@ -205,12 +205,12 @@ impl Wander {
         });
         // Drawn last, so that a run without it draws what it always did. Uniform, with the deviation asked for.
         let grip = 3.0_f64.sqrt() * config.grip_m * rng.random_range(-1.0..=1.0);
-        let turn = config.turn * rng.random_range(-1.0..=1.0);
+        let turn = config.turn * rng.random_range(-1.0..=1.0) * turns;
         Self {
             ramp: config.ramp_m,
             release: config.release,
             grip,
-            turn: (config.turn > 0.0).then_some(turn),
+            turn: (config.turn * turns > 0.0).then_some(turn),
             turned: 0.0,
             axes,
             clock: 0.0,
@@ -277,9 +277,9 @@ impl Wander {
 
     /// The part of the excursion that brings the hand's turn from `goal`'s to that of this rollout, rad.
     fn turning(&mut self, env: &Env, goal: &Pose, free: f64, height: f64) -> f64 {
-        let (sim, largest) = (env.sim(), env.task().put_down_turn());
-        let Some(turn) = self.turn.filter(|_| largest > 0.0) else { return 0.0 };
-        let way = turn * largest - turn_from(&env.task().home(), goal);
+        let sim = env.sim();
+        let Some(turn) = self.turn else { return 0.0 };
+        let way = turn - turn_from(&env.task().home(), goal);
         let (from, over) = LEAVES;
         let left = if sim.touching() { 0.0 } else { ((self.away(env) - from) / over).clamp(0.0, 1.0) };
         // An object that is being put down is no longer turned: it would rub on the table.

@@ -7,7 +7,7 @@ use e2h_policy::sac::SacConfig;
 use serde::{Deserialize, Serialize};
 
 pub(crate) use agents::{Agents, Report};
-pub(crate) use trip::{Kind, Trip, play, replay};
+pub(crate) use trip::{Kind, Trip, play, replay, side};
 
 /// Of which directions there are demonstrations.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]

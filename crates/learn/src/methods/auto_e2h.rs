@@ -30,7 +30,6 @@ pub fn candidates(round: &Round<'_>, reversed: Vec<Episode>, notes: &mut Vec<Str
     let r = &round.config.refine;
     let mut candidates: Vec<Episode> =
         reversed.into_iter().filter(|e| gate(e, &r.gate, &r.reverse)).collect();
-    let mut loose = 0;
     if let Some(goal) = Goal::fit(&round.demonstrations.hard, &r.goal) {
         let before = candidates.len();
         if r.goal.enabled {
@@ -39,7 +38,7 @@ pub fn candidates(round: &Round<'_>, reversed: Vec<Episode>, notes: &mut Vec<Str
         notes.push(goal_note(&goal, &round.rollouts.hard, candidates.len(), before));
     }
     if r.gate.loose_m > 0.0 {
-        let all = candidates.len();
+        let (all, mut loose) = (candidates.len(), 0);
         candidates = candidates
             .into_iter()
             .map(|e| {

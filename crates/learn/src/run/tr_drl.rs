@@ -4,7 +4,8 @@ use super::stage::PolicyStage;
 use super::{Accepted, Run, folder};
 use crate::progress::Bar;
 use crate::record::{Collection, ResetCause, RunResults};
-use crate::tr_drl::{Agents, Demonstrated, Kind, Report, Trip, play, replay};
+use crate::rollout;
+use crate::tr_drl::{Agents, Demonstrated, Kind, Report, Trip, play, replay, side};
 use crate::{Error, Result};
 use e2h_core::{Direction, Episode, State, align_hemisphere, stream};
 use e2h_env::Env;
@@ -47,7 +48,7 @@ struct Tally {
 
 impl Tally {
     fn add(&mut self, direction: Direction, report: Report) {
-        let d = usize::from(direction == Direction::Easy);
+        let d = side(direction);
         self.updates += 1;
         self.loss += (f64::from(report.critic_loss) - self.loss) / self.updates as f64;
         for (all, n) in self.reversed.iter_mut().zip(report.reversed) {
@@ -161,7 +162,7 @@ impl Run {
                 )));
             }
             if kept > 0 {
-                let mut rng = stream(seed, "tr-drl/potential", 0, u64::from(direction == Direction::Easy));
+                let mut rng = stream(seed, "tr-drl/potential", 0, side(direction) as u64);
                 agents.learn_potentials(direction, c.potential_steps, &mut rng)?;
                 self.progress.say(&format!("{direction} demonstrations: {kept} of {} adapted", all.len()));
             }
@@ -256,16 +257,13 @@ impl Run {
         let named = |purpose: &str| {
             stream(self.options.seed, &format!("tr-drl/{purpose}/{direction}"), n.into(), i as u64)
         };
-        let (mut reset, mut draw, mut learn) = (named("reset"), named("act"), named("learn"));
-        // A start that diverges is no start.
-        let mut tries = 0;
-        while let Err(error) = env.reset(direction, &mut reset) {
-            tries += 1;
-            if !matches!(error, e2h_env::Error::Diverged(_)) || tries > 10 {
-                return Err(error.into());
-            }
-        }
+        let (mut draw, mut learn) = (named("act"), named("learn"));
+        let (seed, purpose) = (self.options.seed, format!("tr-drl/reset/{direction}"));
+        let diverged = rollout::reset(env, direction, seed, &purpose, n.into(), i as u64)?;
         *tally.resets.entry(ResetCause::Episode).or_default() += 1;
+        if diverged > 0 {
+            *tally.resets.entry(ResetCause::ResetDiverged).or_default() += diverged;
+        }
         let random = number < c.random_episodes;
         let adapter = agents.adapter(direction).clone();
         let trip = play(env, &adapter, direction, c.reward, |state| {
@@ -278,7 +276,7 @@ impl Run {
             }
             agents.act(direction, state, &mut draw)
         })?;
-        let d = usize::from(direction == Direction::Easy);
+        let d = side(direction);
         tally.episodes[d] += 1;
         tally.steps += trip.steps;
         agents.remember(&trip, Kind::Rollout);

@@ -1,7 +1,7 @@
 //! Both agents, what they share, and an update.
 
 use super::TrDrlConfig;
-use super::trip::{Kind, Row, Trip, other, parts};
+use super::trip::{Kind, Parts, Row, Trip, parts, side};
 use crate::Result;
 use e2h_core::{Direction, Rng, stream};
 use e2h_nn::{Compute, Weights};
@@ -43,10 +43,6 @@ pub(crate) struct Agents {
     models: Models,
     confirmation: Confirmation,
     config: TrDrlConfig,
-}
-
-fn side(direction: Direction) -> usize {
-    usize::from(direction == Direction::Easy)
 }
 
 impl Agents {
@@ -97,7 +93,7 @@ impl Agents {
     /// Remembers an episode in both directions.
     pub(crate) fn remember(&mut self, trip: &Trip, kind: Kind) {
         let (reward, gamma) = (self.config.reward, self.config.agent.gamma);
-        let [mine, theirs] = [trip.direction, other(trip.direction)].map(side);
+        let [mine, theirs] = [trip.direction, trip.direction.reverse()].map(side);
         for row in trip.reversed(reward, gamma) {
             self.sides[theirs].reversed.push(&row.numbers());
         }
@@ -129,7 +125,7 @@ impl Agents {
         rng: &mut Rng,
     ) -> Result<()> {
         self.sides[side(direction)].own.learn(steps, POTENTIAL_BATCH, rng)?;
-        self.sides[side(other(direction))].turned.learn(steps, POTENTIAL_BATCH, rng)?;
+        self.sides[side(direction.reverse())].turned.learn(steps, POTENTIAL_BATCH, rng)?;
         Ok(())
     }
 
@@ -151,10 +147,10 @@ impl Agents {
         if !reversed.is_empty() {
             // The models know the hard task's view alone.
             let view = &self.sides[0].adapter;
-            let of = |f: fn(&super::trip::Parts<'_>) -> Vec<f32>| -> Vec<f32> {
-                reversed.iter().flat_map(|row| view.observe(&f(&parts(row, width)))).collect()
+            let of = |part: for<'a> fn(&Parts<'a>) -> &'a [f32]| -> Vec<f32> {
+                reversed.iter().flat_map(|row| view.observe(part(&parts(row, width)))).collect()
             };
-            let (now, next) = (of(|p| p.now.to_vec()), of(|p| p.next.to_vec()));
+            let (now, next) = (of(|p| p.now), of(|p| p.next));
             let (actions, good) = self.models.propose(&now, &next, &self.confirmation)?;
             for ((row, action), good) in reversed.iter().zip(actions.chunks_exact(width)).zip(&good) {
                 if *good {

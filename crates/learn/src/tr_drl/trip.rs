@@ -32,15 +32,9 @@ pub(crate) struct Trip {
     pub(crate) steps: usize,
 }
 
-fn index(direction: Direction) -> usize {
+/// Place of a direction in pairs: the hard one's comes first.
+pub(crate) fn side(direction: Direction) -> usize {
     usize::from(direction == Direction::Easy)
-}
-
-pub(crate) fn other(direction: Direction) -> Direction {
-    match direction {
-        Direction::Hard => Direction::Easy,
-        Direction::Easy => Direction::Hard,
-    }
 }
 
 /// A transition: what is stored of it.
@@ -122,6 +116,9 @@ pub(crate) fn play(
             break 'episode;
         }
     }
+    // An episode that goes on has succeeded if it is in the goal at its end.
+    let last = trip.good.last().is_some_and(|good| good[side(direction)]);
+    trip.success = trip.success.filter(|_| last || reward == Reward::Absorbing);
     Ok(trip)
 }
 
@@ -168,7 +165,7 @@ impl Trip {
         (0..end.min(last))
             .map(|t| match (reward, self.success) {
                 (Reward::Absorbing, Some(at)) if t + 1 >= at => row(t, 1.0 / (1.0 - gamma), 0.0),
-                (Reward::Literal, _) if self.good[t + 1][index(self.direction)] => row(t, 1.0, 1.0),
+                (Reward::Literal, _) if self.good[t + 1][side(self.direction)] => row(t, 1.0, 1.0),
                 _ => row(t, 0.0, f32::from(u8::from(!(self.lost && t + 1 == last)))),
             })
             .collect()
@@ -177,7 +174,7 @@ impl Trip {
     /// Its transitions turned round, for the agent of the other direction; none where that one's goal is not at its beginning. Their actions
     /// are unknown.
     pub(super) fn reversed(&self, reward: Reward, gamma: f32) -> Vec<Row> {
-        let goal = |t: usize| self.good[t][index(other(self.direction))];
+        let goal = |t: usize| self.good[t][side(self.direction.reverse())];
         if !goal(0) {
             return vec![];
         }
@@ -207,7 +204,7 @@ impl Trip {
     pub(crate) fn state(&self, prefix: &str, all: &mut Weights) {
         let flag = |b: bool| f32::from(u8::from(b));
         let success = self.success.map_or(-1.0, |s| s as f32);
-        let notes = vec![index(self.direction) as f32, success, flag(self.lost), self.steps as f32];
+        let notes = vec![side(self.direction) as f32, success, flag(self.lost), self.steps as f32];
         let good: Vec<f32> = self.good.iter().flatten().map(|b| flag(*b)).collect();
         for (name, width, data) in [
             ("states", STATE_DIM, self.states.as_flattened().to_vec()),

@@ -1,6 +1,5 @@
 //! An actor and its adapter as a policy, and on disk.
 
-use super::adapter::REPEAT;
 use super::{Actor, Adapter, SacConfig};
 use crate::folder::{read_description, read_verified, write_description, write_weights};
 use crate::{Error, Provenance, Result};
@@ -114,13 +113,13 @@ impl Policy for StatePolicy {
             let action = self.actor.act(&self.adapter.observe(&now.state), None)?;
             Ok(self.adapter.actions(&now.state, &action).to_vec())
         };
-        const { assert!(REPEAT > 0) };
         histories.iter().map(|h| one(h).map_err(e2h_core::Error::from)).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::REPEAT;
     use super::*;
     use e2h_core::{Direction, Episode, Origin, stream};
 

@@ -89,6 +89,14 @@ pub enum Error {
         /// What is there.
         found: String,
     },
+    /// Data that a policy cannot learn from; all that is in the way.
+    #[error("{what}: {}", problems.iter().map(|p| e2h_core::one_line(p)).collect::<Vec<_>>().join("; "))]
+    Misfit {
+        /// What was looked at.
+        what: String,
+        /// Every problem, with what was expected and found.
+        problems: Vec<String>,
+    },
     /// There is nothing to draw from.
     #[error("sampler: expected windows in at least one set, found none")]
     NoWindows,

@@ -36,6 +36,7 @@ mod file;
 mod fixture;
 pub mod lerobot;
 mod normalise;
+mod recording;
 mod resize;
 mod sample;
 mod window;
@@ -44,6 +45,9 @@ pub use atomic::write as write_atomic;
 pub use error::{Error, Result};
 pub use file::{MOST_TEXT, MOST_WEIGHTS, read_file, read_regular, read_text};
 pub use normalise::{Normaliser, NormaliserConfig};
+pub use recording::{
+    ACTION_FEATURE, CameraLayout, ENVIRONMENT_FEATURE, Layout, RecordedSource, Recording, STATE_FEATURE,
+};
 pub use resize::resize_image;
 pub use sample::{Pick, Sampler, Source};
 pub use window::{Alignment, Window, WindowConfig, Windows};

@@ -71,8 +71,8 @@ pub struct Window {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Windows {
     config: WindowConfig,
-    /// For each episode: the index of its first window, and whether its end is the end of the task.
-    episodes: Vec<(usize, bool)>,
+    /// For each episode: the index of its first window, its rows, and whether its end is the end of the task.
+    episodes: Vec<(usize, usize, bool)>,
     len: usize,
 }
 
@@ -80,13 +80,28 @@ impl Windows {
     /// Indexes the windows; copies nothing.
     #[must_use]
     pub fn new<E: Borrow<Episode>>(episodes: &[E], config: &WindowConfig) -> Self {
+        let lengths = episodes.iter().map(|e| (e.borrow().len(), e.borrow().terminal));
+        Self::of_lengths(lengths, config, 0)
+    }
+
+    /// The same of episodes with so many rows, and whether their end is the end of the task. The last `drop_last` rows of an
+    /// episode are the newest of no window, where more rows are there.
+    ///
+    /// # Source
+    /// LeRobot 0.4.4, `drop_n_last_frames` of `EpisodeAwareSampler`.
+    #[must_use]
+    pub fn of_lengths(
+        episodes: impl IntoIterator<Item = (usize, bool)>,
+        config: &WindowConfig,
+        drop_last: usize,
+    ) -> Self {
         let mut len = 0;
-        let index = |e: &E| {
+        let index = |(rows, terminal): (usize, bool)| {
             let first = len;
-            len += e.borrow().len();
-            (first, e.borrow().terminal)
+            len += rows.saturating_sub(drop_last).max(rows.min(1));
+            (first, rows, terminal)
         };
-        let episodes = episodes.iter().map(index).collect();
+        let episodes = episodes.into_iter().map(index).collect();
         Self { config: config.clone(), episodes, len }
     }
 
@@ -110,9 +125,8 @@ impl Windows {
     pub fn window(&self, index: usize) -> Window {
         assert!(index < self.len, "window {index} of {}", self.len);
         // Empty episodes share their first window's index with the next one; the last of them is the one with rows.
-        let episode = self.episodes.partition_point(|&(first, _)| first <= index) - 1;
-        let (first, terminal) = self.episodes[episode];
-        let rows = self.episodes.get(episode + 1).map_or(self.len, |&(next, _)| next) - first;
+        let episode = self.episodes.partition_point(|&(first, ..)| first <= index) - 1;
+        let (first, rows, terminal) = self.episodes[episode];
         let now = index - first;
         let before = self.config.n_obs_steps.saturating_sub(1);
         let lead = match self.config.alignment {
@@ -158,6 +172,16 @@ mod tests {
         assert_eq!((w.actions, w.mask), (vec![8, 9, 9, 9], vec![true, true, false, false]));
         let w = window(10, false, Alignment::LeRobot, 8);
         assert_eq!((w.actions, w.mask), (vec![7, 8, 9, 9], vec![true, true, true, false]));
+    }
+
+    #[test]
+    fn the_last_rows_of_an_episode_may_be_the_newest_of_no_window() {
+        let config = WindowConfig { horizon: 4, ..WindowConfig::default() };
+        let windows = Windows::of_lengths([(10, true), (0, true), (3, true)], &config, 7);
+        // Three of the first episode; of one that is too short for it, its first row.
+        assert_eq!(windows.len(), 4);
+        assert_eq!((windows.window(2).episode, windows.window(2).actions), (0, vec![2, 3, 4, 5]));
+        assert_eq!((windows.window(3).episode, windows.window(3).actions), (2, vec![0, 1, 2, 2]));
     }
 
     #[test]

@@ -70,7 +70,8 @@ impl Layout {
                 }
                 None if needed => {
                     let there: Vec<&str> = info.features.iter().map(|(n, _)| n.as_str()).collect();
-                    problems.push(format!("`{name}`: expected a vector of numbers, found none among {there:?}"));
+                    problems
+                        .push(format!("`{name}`: expected a vector of numbers, found none among {there:?}"));
                     vec![]
                 }
                 None => vec![],
@@ -112,8 +113,11 @@ impl Layout {
     #[must_use]
     pub fn of_tasks(cameras: &[String], side: usize) -> Self {
         let own = |names: &[&str]| names.iter().map(|n| (*n).to_owned()).collect();
-        let camera =
-            |name: &String| CameraLayout { feature: format!("observation.images.{name}"), height: side, width: side };
+        let camera = |name: &String| CameraLayout {
+            feature: format!("observation.images.{name}"),
+            height: side,
+            width: side,
+        };
         Self {
             fps: CONTROL_HZ,
             state: own(&crate::lerobot::STATE_NAMES),
@@ -203,7 +207,8 @@ impl Recording {
             state
         } else {
             let more = numbers(&table, ENVIRONMENT_FEATURE, layout.environment.len(), episode)?;
-            let rows = state.chunks_exact(layout.state.len()).zip(more.chunks_exact(layout.environment.len()));
+            let rows =
+                state.chunks_exact(layout.state.len()).zip(more.chunks_exact(layout.environment.len()));
             rows.flat_map(|(a, b)| a.iter().chain(b).copied()).collect()
         };
         let wrong = |source| Error::Episode { name: format!("{episode}"), source };
@@ -245,10 +250,9 @@ impl Recording {
     ) -> Result<Self> {
         let len = action.len() / layout.action_width().max(1);
         let mut problems = vec![];
-        for (what, found, width) in [
-            (STATE_FEATURE, &state, layout.state_width()),
-            (ACTION_FEATURE, &action, layout.action_width()),
-        ] {
+        for (what, found, width) in
+            [(STATE_FEATURE, &state, layout.state_width()), (ACTION_FEATURE, &action, layout.action_width())]
+        {
             if found.len() != len * width {
                 problems.push(format!("`{what}`: expected {len} x {width} numbers, found {}", found.len()));
             }
@@ -389,7 +393,10 @@ mod tests {
                 (ACTION_FEATURE.to_owned(), Column::F32((0..rows * 2).map(|i| i as f32).collect())),
                 ("observation.images.front".to_owned(), image(6, 8)),
                 ("observation.images.hand".to_owned(), image(4, 4)),
-                (SUCCESS_FEATURE.to_owned(), Column::Bool((0..rows).map(|t| ends && t + 1 == rows).collect())),
+                (
+                    SUCCESS_FEATURE.to_owned(),
+                    Column::Bool((0..rows).map(|t| ends && t + 1 == rows).collect()),
+                ),
             ];
             writer.push(&Table { rows, columns }, "move").unwrap();
         }
@@ -420,7 +427,10 @@ mod tests {
         let named = |name: &str| Layout::of(dataset.info(), &[name.to_owned()]);
         assert_eq!(named("hand").unwrap().cameras[0].feature, "observation.images.hand");
         let refused = named("wrist").unwrap_err().to_string();
-        assert!(refused.contains("camera `wrist`") && refused.contains("observation.images.front"), "{refused}");
+        assert!(
+            refused.contains("camera `wrist`") && refused.contains("observation.images.front"),
+            "{refused}"
+        );
     }
 
     #[test]
@@ -443,6 +453,9 @@ mod tests {
         let episode = crate::fixture::episode(4);
         let recording = Recording::of_episode(&episode);
         assert_eq!(recording.layout().state_width(), STATE_DIM);
-        assert_eq!((recording.state(2), recording.action(3)), (&episode.state[2][..], &episode.action[3][..]));
+        assert_eq!(
+            (recording.state(2), recording.action(3)),
+            (&episode.state[2][..], &episode.action[3][..])
+        );
     }
 }

@@ -30,7 +30,8 @@ pub(crate) struct BatchBuilder {
     /// Largest normalised state entry.
     limit: f32,
     scaling: Vec<ImageScaling>,
-    side: usize,
+    /// Columns of the images.
+    stride: usize,
 }
 
 impl BatchBuilder {
@@ -43,8 +44,30 @@ impl BatchBuilder {
             tool_frame: config.tool_frame_features,
             limit: if config.state_limit > 0.0 { config.state_limit } else { f32::INFINITY },
             scaling: config.image_scaling.clone(),
-            side: config.image_size,
+            stride: config.image_size,
         }
+    }
+
+    /// The same for images of so many columns, scaled so.
+    pub(crate) fn of_images(self, stride: usize, scaling: &[ImageScaling]) -> Self {
+        Self { stride, scaling: scaling.to_vec(), ..self }
+    }
+
+    /// Appends the scaled state history of one sample as it is, for recordings of any width.
+    pub(crate) fn push_scaled(
+        &mut self,
+        rows: &[usize],
+        state: impl Fn(usize, &mut Vec<f32>),
+        noise: Option<(f32, &mut Rng)>,
+    ) {
+        let start = self.state.len();
+        rows.iter().for_each(|&row| state(row, &mut self.state));
+        if let Some((sigma, rng)) = noise.filter(|(sigma, _)| *sigma > 0.0) {
+            for v in &mut self.state[start..] {
+                *v += sigma * rng.sample::<f32, _>(rand_distr::StandardNormal);
+            }
+        }
+        self.samples += 1;
     }
 
     /// Appends the normalised state history of one sample; `noise` is (standard deviation, stream) in training.
@@ -88,15 +111,27 @@ impl BatchBuilder {
         crop: usize,
         jitter: Option<Jitter>,
     ) {
+        self.push_part(camera, image, corner, [crop, crop], jitter);
+    }
+
+    /// The same for a crop of rows and columns.
+    pub(crate) fn push_part(
+        &mut self,
+        camera: usize,
+        image: &[u8],
+        corner: Corner,
+        [rows, columns]: [usize; 2],
+        jitter: Option<Jitter>,
+    ) {
         let Some(column) = self.images.get_mut(camera) else { return };
         let (contrast, brightness) = jitter.unwrap_or((1.0, 0.0));
         // A table turns the per-pixel arithmetic into a look-up.
         let table: [f32; 256] =
             std::array::from_fn(|v| ((v as f32 / 255.0 - 0.5) * contrast + 0.5 + brightness).clamp(0.0, 1.0));
         let first = column.len();
-        for row in 0..crop {
-            let start = ((corner.0 + row) * self.side + corner.1) * 3;
-            column.extend(image[start..start + crop * 3].iter().map(|&v| table[usize::from(v)]));
+        for row in 0..rows {
+            let start = ((corner.0 + row) * self.stride + corner.1) * 3;
+            column.extend(image[start..start + columns * 3].iter().map(|&v| table[usize::from(v)]));
         }
         if let Some(scaling) = self.scaling.get(camera) {
             scaling.apply(&mut column[first..]);
@@ -127,14 +162,23 @@ impl BatchBuilder {
 
     /// State (B, To * S) and one (B * steps, crop, crop, 3) tensor a camera, on `device`.
     pub(crate) fn tensors(self, crop: usize, device: &Device) -> Result<(Tensor, Vec<Tensor>)> {
+        self.tensors_of([crop, crop], device)
+    }
+
+    /// The same for crops of rows and columns.
+    pub(crate) fn tensors_of(
+        self,
+        [rows, columns]: [usize; 2],
+        device: &Device,
+    ) -> Result<(Tensor, Vec<Tensor>)> {
         let width = self.state.len() / self.samples.max(1);
         let state = Tensor::from_vec(self.state, (self.samples, width), device)?;
         let images = self
             .images
             .into_iter()
             .map(|data| {
-                let n = data.len() / (crop * crop * 3);
-                Tensor::from_vec(data, (n, crop, crop, 3), device)
+                let n = data.len() / (rows * columns * 3);
+                Tensor::from_vec(data, (n, rows, columns, 3), device)
             })
             .collect::<candle_core::Result<_>>()?;
         Ok((state, images))

@@ -1,5 +1,6 @@
 //! Architecture and inference of a policy.
 
+use crate::lerobot::Features;
 use crate::model::Widths;
 use crate::{DiffusionModel, Error, Result};
 use e2h_nn::{Params, RgbEncoderConfig, UnetConfig};
@@ -194,6 +195,16 @@ impl PolicyConfig {
     pub fn state_features(&self) -> usize {
         let more = |on: bool, n: usize| if on { n } else { 0 };
         e2h_core::STATE_DIM + more(self.relative_features, 3) + more(self.tool_frame_features, TOOL_FRAME)
+    }
+
+    /// The same network for what `features` names: the sizes here are those of the crop's rows, which the layers do not ask for.
+    pub(crate) fn seeing(&self, features: &Features) -> Self {
+        Self {
+            cameras: features.cameras.clone(),
+            image_size: features.crop[0],
+            crop_size: features.crop[0],
+            ..self.clone()
+        }
     }
 
     /// Width of the U-Net's global condition.

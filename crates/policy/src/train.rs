@@ -1,11 +1,12 @@
 //! Training of a diffusion policy, one step at a time, exactly resumable.
 
-use crate::batch::{BatchBuilder, Rows};
-use crate::model::widened;
+use crate::batch::BatchBuilder;
+use crate::examples::TrainingData;
+use crate::lerobot::Features;
+use crate::model::{Widths, widened};
 use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
-use e2h_core::{ACTION_DIM, Episode, Rng, stream};
-use e2h_data::{Alignment, Normaliser, Sampler, Source, Window, WindowConfig, Windows};
+use e2h_core::{ACTION_DIM, Rng, stream};
 use e2h_nn::{
     Adam, Compute, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows,
 };
@@ -13,44 +14,6 @@ use rand::Rng as _;
 use sha2::{Digest as _, Sha256};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
-
-/// What a policy learns from: windows of weighted sources, and how they are scaled.
-pub struct TrainingData<'a> {
-    sources: Vec<(&'a Source, Windows)>,
-    sampler: Sampler,
-    normaliser: &'a Normaliser,
-}
-
-impl<'a> TrainingData<'a> {
-    /// Windows over `sources`, of which every batch takes as much as their shares say.
-    ///
-    /// # Errors
-    /// When there is nothing to draw from.
-    pub fn new(sources: &'a [Source], config: &PolicyConfig, normaliser: &'a Normaliser) -> Result<Self> {
-        let window = WindowConfig {
-            n_obs_steps: config.n_obs_steps,
-            horizon: config.horizon,
-            alignment: if config.lerobot_alignment { Alignment::LeRobot } else { Alignment::Paper },
-        };
-        let windows: Vec<_> = sources.iter().map(|s| (s, Windows::new(&s.episodes, &window))).collect();
-        let shares: Vec<_> = windows.iter().zip(sources).map(|((_, w), s)| (w, f64::from(s.share))).collect();
-        let sampler = Sampler::new(&shares)?;
-        Ok(Self { sources: windows, sampler, normaliser })
-    }
-
-    /// Windows of a batch with their episodes and what is known of their sources: the indicators, 0 where nothing is.
-    fn batch(&self, size: usize, rng: &mut Rng) -> Vec<(&Episode, Window, f32)> {
-        let picks = self.sampler.batch(size, rng);
-        picks
-            .into_iter()
-            .map(|pick| {
-                let (source, windows) = &self.sources[pick.source];
-                let window = windows.window(pick.window);
-                (&*source.episodes[window.episode], window, source.label.unwrap_or_default())
-            })
-            .collect()
-    }
-}
 
 /// Where a training state's header has its checksum.
 const SEAL: &str = "sha256";
@@ -101,7 +64,7 @@ impl Skipped {
 /// What the network is asked in a step, and the answer.
 ///
 /// # Shapes
-/// `noisy` and `target` (rows, T, 8), `timesteps` (rows), `condition` (rows, condition), `mask` (rows, T); a row is one of the
+/// `noisy` and `target` (rows, T, action), `timesteps` (rows), `condition` (rows, condition), `mask` (rows, T); a row is one of the
 /// noises of one of the step's conditions.
 struct Batch {
     noisy: Tensor,
@@ -119,6 +82,7 @@ pub struct Trainer {
     ema: Ema,
     ddim: Ddim,
     config: PolicyConfig,
+    widths: Widths,
     train: TrainConfig,
     schedule: LrSchedule,
     seed: u64,
@@ -144,6 +108,34 @@ impl Trainer {
         seed: u64,
         purpose: &str,
     ) -> Result<Self> {
+        let widths = Widths { state: config.state_features(), action: ACTION_DIM };
+        Self::of_widths(config, widths, train, steps, start, seed, purpose)
+    }
+
+    /// The same for recordings of any robot. `config` says nothing of their cameras and sizes: that is up to `features`.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`].
+    pub fn of_features(
+        config: &PolicyConfig,
+        features: &Features,
+        train: &TrainConfig,
+        steps: usize,
+        seed: u64,
+        purpose: &str,
+    ) -> Result<Self> {
+        Self::of_widths(&config.seeing(features), features.widths(), train, steps, None, seed, purpose)
+    }
+
+    fn of_widths(
+        config: &PolicyConfig,
+        widths: Widths,
+        train: &TrainConfig,
+        steps: usize,
+        start: Option<&Weights>,
+        seed: u64,
+        purpose: &str,
+    ) -> Result<Self> {
         if config.encoder_norm == EncoderNorm::Folded {
             return Err(Error::Config(
                 "encoder_norm: expected group, got folded: without its batch norm the encoder is for acting only"
@@ -154,7 +146,8 @@ impl Trainer {
         if !problems.is_empty() {
             return Err(Error::Config(problems.join("; ")));
         }
-        let model = DiffusionModel::new(config, Mode::Train, &mut stream(seed, "weights", 0, 0))?;
+        let rng = &mut stream(seed, "weights", 0, 0);
+        let model = DiffusionModel::of_widths(&Compute::cpu(), config, widths, Mode::Train, rng)?;
         if let Some(weights) = start {
             if config.indicator {
                 model.params.import(&widened(config, weights))?;
@@ -177,6 +170,7 @@ impl Trainer {
             ema,
             ddim,
             config: config.clone(),
+            widths,
             train: train.clone(),
             schedule: train.schedule.over(steps),
             seed,
@@ -196,7 +190,7 @@ impl Trainer {
             return Ok(self);
         }
         let rng = &mut stream(self.seed, "weights", 0, 0);
-        let model = DiffusionModel::new_on(compute, &self.config, Mode::Train, rng)?;
+        let model = DiffusionModel::of_widths(compute, &self.config, self.widths, Mode::Train, rng)?;
         model.params.import(&self.model.params.export()?)?;
         let mut adam = Adam::new(&self.train.optimiser(), &model.params)?;
         adam.load_state(&self.adam.state()?)?;
@@ -246,45 +240,72 @@ impl Trainer {
         Ok(value)
     }
 
+    /// Mean loss of the averaged weights over `batches` batches of `data`, the same ones in every call: crops are centred and
+    /// nothing is disturbed.
+    ///
+    /// # Errors
+    /// When the data do not fit.
+    pub fn validation_loss(&self, data: &TrainingData<'_>, batches: usize) -> Result<f64> {
+        let rng = &mut stream(self.seed, "weights", 0, 0);
+        let compute = self.model.params.compute();
+        let model = DiffusionModel::of_widths(compute, &self.config, self.widths, Mode::Infer, rng)?;
+        model.params.import(&self.ema.weights()?)?;
+        let plain = TrainConfig { conditioning_dropout: 0.0, observation_noise: 0.0, ..self.train.clone() };
+        let mut sum = 0.0;
+        for i in 0..batches {
+            let rng = &mut stream(self.seed, "validate", 0, i as u64);
+            let loss = self.loss_of(&model, data, &plain, true, rng)?;
+            sum += f64::from(loss.to_scalar::<f32>()?);
+        }
+        Ok(sum / batches.max(1) as f64)
+    }
+
     fn loss(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Tensor> {
-        let batch = self.draw(data, rng)?;
-        let output = self.model.forward(&batch.noisy, &batch.timesteps, &batch.condition)?;
+        self.loss_of(&self.model, data, &self.train, false, rng)
+    }
+
+    fn loss_of(
+        &self,
+        model: &DiffusionModel,
+        data: &TrainingData<'_>,
+        train: &TrainConfig,
+        centred: bool,
+        rng: &mut Rng,
+    ) -> Result<Tensor> {
+        let batch = self.draw(model, data, train, centred, rng)?;
+        let output = model.forward(&batch.noisy, &batch.timesteps, &batch.condition)?;
         Ok(mse(&output, &batch.target, Some(&batch.mask))?)
     }
 
-    fn draw(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Batch> {
-        let (c, t) = (&self.config, &self.train);
-        let mut batch = BatchBuilder::new(c);
-        let (per, rows) = (c.horizon * ACTION_DIM, t.conditions * t.noises);
+    fn draw(
+        &self,
+        model: &DiffusionModel,
+        data: &TrainingData<'_>,
+        t: &TrainConfig,
+        centred: bool,
+        rng: &mut Rng,
+    ) -> Result<Batch> {
+        let (c, action) = (&self.config, self.widths.action);
+        let mut batch = BatchBuilder::new(c).of_images(data.columns(c), data.scaling(c));
+        let (per, rows) = (c.horizon * action, t.conditions * t.noises);
         let mut clean = Vec::with_capacity(t.conditions * per);
         let mut mask = Vec::with_capacity(rows * c.horizon);
         let first_image = c.n_obs_steps - c.n_image_steps;
         let mut indicators = Vec::with_capacity(rows);
-        for (episode, window, indicator) in data.batch(t.conditions, rng) {
-            batch.push_state(
-                Rows::Episode(episode, &window.observations),
-                data.normaliser,
-                Some((t.observation_noise, rng)),
-            );
+        for example in data.batch(t.conditions, rng) {
+            let (window, indicator) = (&example.window, example.indicator);
+            example.push_state(&mut batch, Some((t.observation_noise, rng)));
             if c.n_image_steps > 0 {
-                for (camera, name) in c.cameras.iter().enumerate() {
-                    let corner = c.random_crop(rng);
-                    let named = episode.frames.iter().find(|f| f.camera == *name);
-                    let frames = named.filter(|f| f.height == c.image_size).ok_or_else(|| {
-                        Error::Data(format!(
-                            "expected images of {0} x {0} from {1:?}, found {2:?}",
-                            c.image_size,
-                            c.cameras,
-                            episode.frames.iter().map(|f| (&f.camera, f.height, f.width)).collect::<Vec<_>>()
-                        ))
-                    })?;
+                for camera in 0..c.cameras.len() {
+                    let corner = example.corner(c, (!centred).then_some(&mut *rng));
+                    let frames = example.frames(c, camera)?;
                     for &row in &window.observations[first_image..] {
-                        batch.push_image(camera, &frames.image(row)?, corner, c.crop_size, None);
+                        batch.push_part(camera, &frames.image(row)?, corner, data.crop(c), None);
                     }
                 }
             }
             for &row in &window.actions {
-                clean.extend(data.normaliser.normalise_action(&episode.action[row]));
+                example.push_action(row, &mut clean);
             }
             for _ in 0..t.noises {
                 indicators.push(indicator);
@@ -318,16 +339,16 @@ impl Trainer {
                 }
             }
         }
-        let device = self.model.device();
-        let (state, images) = batch.tensors(c.crop_size, device)?;
-        let mut condition = repeat_rows(&self.model.condition(&state, &images)?, t.noises)?;
+        let device = model.device();
+        let (state, images) = batch.tensors_of(data.crop(c), device)?;
+        let mut condition = repeat_rows(&model.condition(&state, &images)?, t.noises)?;
         if keep.contains(&0.0) {
             condition = condition.broadcast_mul(&Tensor::from_vec(keep, (rows, 1), device)?)?;
         }
         if c.indicator {
-            condition = self.model.indicate(&condition, &indicators)?;
+            condition = model.indicate(&condition, &indicators)?;
         }
-        let shape = (rows, c.horizon, ACTION_DIM);
+        let shape = (rows, c.horizon, action);
         Ok(Batch {
             noisy: Tensor::from_vec(noisy, shape, device)?,
             timesteps,
@@ -412,8 +433,8 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use e2h_core::{Direction, Observation, Origin};
-    use e2h_data::NormaliserConfig;
+    use e2h_core::{Direction, Episode, Observation, Origin};
+    use e2h_data::{Normaliser, NormaliserConfig, Source};
     use std::sync::Arc;
 
     /// The last entry of every row's condition, its other entries, and what else was drawn.
@@ -430,7 +451,8 @@ mod tests {
         let sources = [source(0.5).labelled(1.0), source(0.25).labelled(-1.0), source(0.25)];
         let data = TrainingData::new(&sources, config, &normaliser).unwrap();
         let trainer = Trainer::new(config, train, 1, None, 1, "test").unwrap();
-        let batch = trainer.draw(&data, &mut stream(1, "test", 0, step)).unwrap();
+        let rng = &mut stream(1, "test", 0, step);
+        let batch = trainer.draw(&trainer.model, &data, train, false, rng).unwrap();
         let rows = batch.condition.to_vec2::<f32>().unwrap();
         assert_eq!(rows[0].len(), config.condition_dim());
         let observed = config.condition_dim() - usize::from(config.indicator);

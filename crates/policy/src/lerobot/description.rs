@@ -1,8 +1,8 @@
 //! `config.json`, and what of a policy it can and cannot say.
 
-use super::{ACTION, IMAGES, STATE};
+use super::features::Features;
+use super::{ACTION, ENVIRONMENT, STATE};
 use crate::{EncoderNorm, PolicyConfig, Prediction, SamplerKind};
-use e2h_core::{ACTION_DIM, STATE_DIM};
 use serde::de::{MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::collections::BTreeMap;
@@ -222,6 +222,15 @@ pub(super) const GROUPS: usize = 8;
 /// All that keeps a policy of this configuration from being written for LeRobot; empty when nothing does.
 #[must_use]
 pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
+    let mut found = network_obstacles(c);
+    if c.cameras.is_empty() {
+        found.insert(0, Obstacle::new("cameras", "at least one", "none"));
+    }
+    found
+}
+
+/// The same of the network alone, whatever goes into it.
+pub(super) fn network_obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
     let mut found = vec![];
     let mut ask = |ok: bool, setting: &str, expected: String, is: String| {
         if !ok {
@@ -234,7 +243,6 @@ pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
         "true (the first action belongs to the oldest observation)".to_owned(),
         "false".to_owned(),
     );
-    ask(!c.cameras.is_empty(), "cameras", "at least one".to_owned(), "none".to_owned());
     let (steps, images) = (c.n_obs_steps, c.n_image_steps);
     ask(images == steps, "n_image_steps", format!("{steps}, as n_obs_steps"), images.to_string());
     ask(!c.relative_features, "relative_features", "false".to_owned(), "true".to_owned());
@@ -282,25 +290,27 @@ pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
 
 impl Description {
     /// Of a policy without [`obstacles`].
-    pub(super) fn of(c: &PolicyConfig) -> Self {
+    pub(super) fn of(c: &PolicyConfig, f: &Features, modes: BTreeMap<String, String>) -> Self {
         let feature = |kind: &str, shape: &[usize]| Feature { kind: kind.to_owned(), shape: shape.to_vec() };
-        let mut inputs = vec![(STATE.to_owned(), feature("STATE", &[STATE_DIM]))];
-        for camera in &c.cameras {
-            let shape = [3, c.image_size, c.image_size];
-            inputs.push((format!("{IMAGES}{camera}"), feature("VISUAL", &shape)));
+        let mut inputs = vec![(STATE.to_owned(), feature("STATE", &[f.state]))];
+        if f.environment > 0 {
+            inputs.push((ENVIRONMENT.to_owned(), feature("ENV", &[f.environment])));
+        }
+        for camera in &f.cameras {
+            inputs.push((camera.clone(), feature("VISUAL", &[3, f.size[0], f.size[1]])));
         }
         let backbone = BACKBONES.iter().find(|(_, blocks)| c.encoder_blocks == blocks);
         Self {
             kind: "diffusion".to_owned(),
             n_obs_steps: c.n_obs_steps,
             input_features: InOrder(inputs),
-            output_features: InOrder(vec![(ACTION.to_owned(), feature("ACTION", &[ACTION_DIM]))]),
+            output_features: InOrder(vec![(ACTION.to_owned(), feature("ACTION", &[f.action]))]),
             horizon: c.horizon,
             n_action_steps: c.n_action_steps,
-            normalization_mapping: Self::modes(c),
+            normalization_mapping: modes,
             drop_n_last_frames: (c.horizon + 1).saturating_sub(c.n_action_steps + c.n_obs_steps),
             vision_backbone: backbone.map_or("resnet18", |(name, _)| name).to_owned(),
-            crop_shape: Some([c.crop_size, c.crop_size]),
+            crop_shape: (!f.cameras.is_empty()).then_some(f.crop),
             spatial_softmax_num_keypoints: c.keypoints,
             use_separate_rgb_encoder_per_camera: !c.share_encoder,
             down_dims: c.down_dims.clone(),
@@ -321,12 +331,5 @@ impl Description {
             num_inference_steps: Some(c.inference_steps),
             ..Self::default()
         }
-    }
-
-    fn modes(c: &PolicyConfig) -> BTreeMap<String, String> {
-        let images = if c.image_scaling.is_empty() { "IDENTITY" } else { "MEAN_STD" };
-        [("STATE", "MIN_MAX"), ("VISUAL", images), ("ACTION", "MIN_MAX")]
-            .map(|(kind, mode)| (kind.to_owned(), mode.to_owned()))
-            .into()
     }
 }

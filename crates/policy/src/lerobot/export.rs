@@ -1,7 +1,10 @@
 //! A checkpoint of ours as a folder for LeRobot.
 
-use super::description::{Description, obstacles};
+use super::description::{Description, network_obstacles, obstacles};
+use super::features::Features;
+use super::scaling::Scalings;
 use super::{CONFIG_FILE, POSITION_GRID, processors};
+use crate::folder::write_weights;
 use crate::{Checkpoint, Error, PolicyConfig, Provenance, Result};
 use e2h_data::write_atomic;
 use e2h_nn::{SpatialSoftmax, Weights};
@@ -51,16 +54,54 @@ pub fn export(checkpoint: &Path, dir: &Path) -> Result<Exported> {
         path: dir.to_owned(),
         source,
     })?;
-    let description = Description::of(c);
-    let header =
-        Header { version: env!("CARGO_PKG_VERSION").to_owned(), provenance: ours.provenance.clone() };
-    // One entry, because the library writes several in no fixed order.
-    let metadata = BTreeMap::from([(HEADER.to_owned(), json(&header, dir)?)]);
-    ours.write_with(dir, &with_grids(weights, c), &metadata)?;
-    processors::write(dir, &description, c, &ours.normaliser)?;
+    let (features, scalings) = (Features::of_tasks(c), Scalings::of(&ours.normaliser, &c.image_scaling));
+    ours.write_with(dir, &with_grids(weights, c, features.crop), &metadata(&ours.provenance, dir)?)?;
+    describe(dir, c, &features, &scalings)?;
+    Ok(Exported { files: files(dir)?, notes: notes(c) })
+}
+
+/// Writes a policy that was trained on recordings into `dir`, a new folder: what [`super::import`] and LeRobot open.
+///
+/// # Errors
+/// [`Error::Lerobot`] lists everything that LeRobot cannot express; nothing is written then. Also when a weight is not finite
+/// or the folder cannot be written.
+pub fn save(
+    dir: &Path,
+    c: &PolicyConfig,
+    features: &Features,
+    scalings: &Scalings,
+    weights: &Weights,
+    provenance: &Provenance,
+) -> Result<()> {
+    let problems = network_obstacles(c);
+    if !problems.is_empty() {
+        let path = dir.to_owned();
+        return Err(Error::Lerobot { doing: "writing for LeRobot", path, obstacles: problems });
+    }
+    std::fs::create_dir_all(dir).map_err(|source| Error::Io {
+        doing: "creating",
+        path: dir.to_owned(),
+        source,
+    })?;
+    let weights = weights.clone();
+    let weights = if features.cameras.is_empty() { weights } else { with_grids(weights, c, features.crop) };
+    write_weights(dir, &weights, &metadata(provenance, dir)?)?;
+    describe(dir, c, features, scalings)
+}
+
+/// Where the weights come from. One entry, because the library writes several in no fixed order.
+fn metadata(provenance: &Provenance, dir: &Path) -> Result<BTreeMap<String, String>> {
+    let header = Header { version: env!("CARGO_PKG_VERSION").to_owned(), provenance: provenance.clone() };
+    Ok(BTreeMap::from([(HEADER.to_owned(), json(&header, dir)?)]))
+}
+
+/// Writes all but the weights; `config.json` last.
+fn describe(dir: &Path, c: &PolicyConfig, features: &Features, scalings: &Scalings) -> Result<()> {
+    let description = Description::of(c, features, processors::modes(scalings));
+    processors::write(dir, &description, scalings)?;
     let path = dir.join(CONFIG_FILE);
     write_atomic(&path, json(&description, &path)?.as_bytes())?;
-    Ok(Exported { files: files(dir)?, notes: notes(c) })
+    Ok(())
 }
 
 fn json(value: &impl Serialize, path: &Path) -> Result<String> {
@@ -69,8 +110,8 @@ fn json(value: &impl Serialize, path: &Path) -> Result<String> {
 }
 
 /// LeRobot keeps the positions of the spatial softmax beside the weights.
-fn with_grids(mut weights: Weights, c: &PolicyConfig) -> Weights {
-    let (h, w) = c.encoder(c.crop_size, c.crop_size).map_size();
+fn with_grids(mut weights: Weights, c: &PolicyConfig, crop: [usize; 2]) -> Weights {
+    let (h, w) = c.encoder(crop[0], crop[1]).map_size();
     let ends = ".pool.nets.weight";
     let encoders: Vec<String> =
         weights.keys().filter_map(|n| n.strip_suffix(ends).map(str::to_owned)).collect();

@@ -1,7 +1,8 @@
 //! A folder of LeRobot's as a policy.
 
-use super::description::{BACKBONE_WIDTH, BACKBONES, Description, Feature, GROUPS, Obstacle};
+use super::description::{BACKBONE_WIDTH, BACKBONES, Description, GROUPS, Obstacle};
 use super::export::{HEADER, Header};
+use super::features::Features;
 use super::fold;
 use super::policy::LerobotPolicy;
 use super::processors::{POSTPROCESSOR, PREPROCESSOR, Statistics};
@@ -137,65 +138,6 @@ fn rounding(v: f32) -> f32 {
         0..=7 => 1.0 / 256.0,
         8..=10 => 1.0 / 2048.0,
         _ => 1e-6,
-    }
-}
-
-/// Numbers that a state or an action may have, and sides of an image.
-const WIDEST: usize = 1 << 16;
-
-/// What goes in and comes out.
-struct Features {
-    state: usize,
-    environment: usize,
-    action: usize,
-    cameras: Vec<String>,
-    size: [usize; 2],
-    crop: [usize; 2],
-}
-
-impl Features {
-    fn of(d: &Description, problems: &mut Vec<Obstacle>) -> Self {
-        let mut vector = |all: &[(String, Feature)], name: &str, needed: bool| match all
-            .iter()
-            .find(|(n, _)| n == name)
-            .map(|(_, f)| &f.shape[..])
-        {
-            Some(&[n]) if n > 0 && n <= WIDEST => n,
-            None if !needed => 0,
-            found => {
-                problems.push(Obstacle::new(name, "a vector of up to 65536 numbers", format!("{found:?}")));
-                0
-            }
-        };
-        let (inputs, outputs) = (&d.input_features.0, &d.output_features.0);
-        let state = vector(inputs, STATE, true);
-        let environment = vector(inputs, ENVIRONMENT, false);
-        let action = vector(outputs, ACTION, true);
-        let images: Vec<&(String, Feature)> = inputs.iter().filter(|(_, f)| f.kind == "VISUAL").collect();
-        let mut size = [0; 2];
-        for (name, feature) in &images {
-            match feature.shape[..] {
-                [3, h, w] if h.max(w) <= WIDEST && (size == [0; 2] || size == [h, w]) => size = [h, w],
-                _ => problems.push(Obstacle::new(
-                    name,
-                    "3 channels and the same size in all cameras",
-                    format!("{:?}", feature.shape),
-                )),
-            }
-        }
-        let crop = d.crop_shape.unwrap_or(size);
-        if !images.is_empty() && (crop[0] > size[0] || crop[1] > size[1] || crop.contains(&0)) {
-            problems.push(Obstacle::new("crop_shape", format!("1 to {size:?}"), format!("{crop:?}")));
-        }
-        if !images.is_empty() && environment > 0 {
-            problems.push(Obstacle::new(
-                ENVIRONMENT,
-                "none beside images",
-                format!("{environment} numbers and {} cameras", images.len()),
-            ));
-        }
-        let cameras = images.iter().map(|(n, _)| n.clone()).collect();
-        Self { state, environment, action, cameras, size, crop }
     }
 }
 

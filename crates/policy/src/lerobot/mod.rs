@@ -3,7 +3,7 @@
 //! [`export`] turns a checkpoint of ours into a folder that `DiffusionPolicy.from_pretrained` opens, with pre- and
 //! post-processor; [`obstacles`] says what of a configuration LeRobot cannot express. [`import`] opens such a folder, whatever
 //! the widths of its state and action are, and [`LerobotPolicy::into_policy`] makes one of ours of it where they are this
-//! project's. Batch norm is folded into the convolutions: such a policy acts, and is not trained further.
+//! project's. [`save`] writes what a [`crate::Trainer`] learned from recordings of any robot. Batch norm is folded into the convolutions: such a policy acts, and is not trained further.
 //!
 //! | file | holds |
 //! |---|---|
@@ -18,6 +18,7 @@
 
 mod description;
 mod export;
+mod features;
 mod fold;
 mod import;
 mod policy;
@@ -25,14 +26,18 @@ mod processors;
 mod scaling;
 
 pub use description::{Obstacle, obstacles};
-pub use export::{Exported, HEADER, export};
+pub use export::{Exported, HEADER, export, save};
+pub use features::Features;
 pub use import::import;
 pub use policy::{LerobotObservation, LerobotPolicy};
+pub use scaling::{IMAGENET, Scaling, Scalings};
 
 const CONFIG_FILE: &str = "config.json";
 const WEIGHTS_FILE: &str = "model.safetensors";
 /// A buffer of LeRobot's that is computed here: the positions of the spatial softmax.
 pub(crate) const POSITION_GRID: &str = ".pool.pos_grid";
+/// LeRobot's guard against divisions by zero.
+const EPS: f64 = 1e-8;
 const STATE: &str = "observation.state";
 const ENVIRONMENT: &str = "observation.environment_state";
 const IMAGES: &str = "observation.images.";

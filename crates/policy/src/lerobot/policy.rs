@@ -239,7 +239,7 @@ impl LerobotPolicy {
 }
 
 /// Where torchvision puts the first row of a centred crop: half of what is left over, halves to the even number.
-fn centre(border: usize) -> usize {
+pub(super) fn centre(border: usize) -> usize {
     let half = border / 2;
     if border % 2 == 1 && half % 2 == 1 { half + 1 } else { half }
 }

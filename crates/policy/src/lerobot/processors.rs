@@ -1,10 +1,10 @@
 //! The steps before and after the network, with the statistics that they scale by.
 
-use super::ACTION;
 use super::description::{Description, Feature, InOrder, Obstacle};
-use super::scaling::Scaling;
-use crate::{Error, PolicyConfig, Result};
-use e2h_data::{Normaliser, write_atomic};
+use super::scaling::{Scaling, Scalings};
+use super::{ACTION, ENVIRONMENT, EPS, STATE};
+use crate::{Error, Result};
+use e2h_data::write_atomic;
 use e2h_nn::{HostTensor, Weights};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -17,8 +17,6 @@ const NORMALISER: &str = "normalizer_processor";
 const UNNORMALISER: &str = "unnormalizer_processor";
 /// Steps that change no number.
 const HARMLESS: [&str; 3] = ["rename_observations_processor", "to_batch_processor", "device_processor"];
-/// LeRobot's guard against divisions by zero.
-const EPS: f64 = 1e-8;
 
 #[derive(Serialize, Deserialize)]
 struct Pipeline {
@@ -56,8 +54,8 @@ fn step(name: &str, config: Value) -> Step {
 }
 
 /// Writes both pipelines with their statistics, those first.
-pub(super) fn write(dir: &Path, d: &Description, c: &PolicyConfig, normaliser: &Normaliser) -> Result<()> {
-    let statistics = statistics(d, c, normaliser);
+pub(super) fn write(dir: &Path, d: &Description, scalings: &Scalings) -> Result<()> {
+    let statistics = statistics(d, scalings);
     let device = |device: &str| step("device_processor", json!({"device": device, "float_dtype": null}));
     let scaling = |name: &str, features: &[&InOrder<Feature>]| {
         let features: BTreeMap<_, _> = features.iter().flat_map(|f| f.0.iter().cloned()).collect();
@@ -86,19 +84,33 @@ pub(super) fn write(dir: &Path, d: &Description, c: &PolicyConfig, normaliser: &
     Ok(())
 }
 
+/// Modes of the kinds of features, as `config.json` has them.
+pub(super) fn modes(s: &Scalings) -> BTreeMap<String, String> {
+    let images = if s.images.is_empty() { "IDENTITY" } else { "MEAN_STD" };
+    let mut modes = vec![("STATE", s.state.mode()), ("VISUAL", images), ("ACTION", s.action.mode())];
+    modes.extend((s.environment != Scaling::None).then(|| ("ENV", s.environment.mode())));
+    modes.into_iter().map(|(kind, mode)| (kind.to_owned(), mode.to_owned())).collect()
+}
+
 /// Ranges of states and actions, moments of images.
-fn statistics(d: &Description, c: &PolicyConfig, normaliser: &Normaliser) -> Weights {
+fn statistics(d: &Description, scalings: &Scalings) -> Weights {
     let mut all = Weights::new();
     let mut put = |feature: &str, name: &str, data: &[f32], shape: Vec<usize>| {
         all.insert(format!("{feature}.{name}"), HostTensor { shape, data: data.to_vec() });
     };
-    let n = normaliser;
-    put(super::STATE, "min", &n.state_min, vec![n.state_min.len()]);
-    put(super::STATE, "max", &n.state_max, vec![n.state_max.len()]);
-    put(ACTION, "min", &n.action_min, vec![n.action_min.len()]);
-    put(ACTION, "max", &n.action_max, vec![n.action_max.len()]);
+    for (feature, scaling) in
+        [(STATE, &scalings.state), (ENVIRONMENT, &scalings.environment), (ACTION, &scalings.action)]
+    {
+        let [(first, a), (second, b)] = match scaling {
+            Scaling::None => continue,
+            Scaling::Range { min, max, .. } => [("min", min), ("max", max)],
+            Scaling::Moments { mean, std, .. } => [("mean", mean), ("std", std)],
+        };
+        put(feature, first, a, vec![a.len()]);
+        put(feature, second, b, vec![b.len()]);
+    }
     let cameras = d.input_features.0.iter().filter(|(_, f)| f.kind == "VISUAL");
-    for ((name, _), scaling) in cameras.zip(&c.image_scaling) {
+    for ((name, _), scaling) in cameras.zip(&scalings.images) {
         put(name, "mean", &scaling.mean, vec![3, 1, 1]);
         put(name, "std", &scaling.std, vec![3, 1, 1]);
     }

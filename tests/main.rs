@@ -8,6 +8,7 @@ mod errors; // wrong input and trouble with files: a clear message, before any w
 mod examples; // every example binary with the smoke preset
 mod faults; // signals, closed pipes, flipped bits and a MuJoCo that cannot go on
 mod front_door; // what `cargo run` lists, and what every example says of itself
+mod imitation; // `train` on datasets of a robot that this project does not know
 mod pipeline; // refinement, critic and update on scripted rollouts
 mod resume;
 mod tr_drl; // reinforcement learning from states, its loop and its record // kills at random instants, and thread counts: the same bytes

@@ -1,6 +1,6 @@
 //! A run's configuration: preset < task file < `--set key=value`, checked before any work.
 
-mod layers;
+pub(crate) mod layers;
 mod validate;
 
 use crate::methods::{DynamicsStage, RecapConfig};

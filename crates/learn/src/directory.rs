@@ -43,7 +43,7 @@ const LOCK: &str = "run.lock";
 
 /// # Errors
 /// [`Error::Busy`] names the process that works here already.
-fn lock(folder: &Path) -> Result<Option<Arc<File>>> {
+pub(crate) fn lock(folder: &Path) -> Result<Option<Arc<File>>> {
     let place = folder.join(LOCK);
     // Not truncated here: until the lock is ours the words are another's.
     let opened = File::options().read(true).write(true).create(true).truncate(false).open(&place);
@@ -97,7 +97,7 @@ pub(crate) fn write_atomic(path: &Path, bytes: &[u8]) -> Result<()> {
     Ok(e2h_data::write_atomic(path, bytes)?)
 }
 
-fn sync(dir: &Path) -> Result<()> {
+pub(crate) fn sync(dir: &Path) -> Result<()> {
     File::open(dir).and_then(|d| d.sync_all()).map_err(io("syncing", dir))
 }
 

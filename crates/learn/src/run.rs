@@ -319,7 +319,7 @@ fn default_folder(run: &Identity) -> PathBuf {
 }
 
 /// Seconds since 1970, for logs alone.
-fn now() -> f64 {
+pub(crate) fn now() -> f64 {
     std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64())
 }
 

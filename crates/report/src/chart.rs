@@ -99,6 +99,39 @@ pub fn losses(runs: &[&RunResults]) -> String {
     document(WIDTH, 254.0 + taken, "Losses by iteration", &(s + &keys))
 }
 
+/// Loss of one training against the step, and that on held-out episodes, on a logarithmic axis.
+///
+/// # Shapes
+/// `train` and `held_out` are (step, loss); losses that are not above 0 leave a gap.
+#[must_use]
+pub fn training_curve(train: &[(f64, f64)], held_out: &[(f64, f64)]) -> String {
+    let log = |v: f64| if v > 0.0 { v.log10() } else { f64::NAN };
+    let all = || train.iter().chain(held_out);
+    let values = || all().map(|p| log(p.1)).filter(|v| v.is_finite());
+    let (low, high) = values().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(v), h.max(v)));
+    let (low, high) =
+        if low <= high { (low.floor(), high.ceil().max(low.floor() + 1.0)) } else { (-3.0, 0.0) };
+    let last = all().map(|p| p.0).fold(1.0, f64::max);
+    let axes =
+        Axes { left: 80.0, top: 20.0, width: WIDTH - 104.0, height: 270.0, x: (0.0, last), y: (low, high) };
+    let decades: Vec<f64> = ticks(low, high, (high - low).min(6.0));
+    let mut s = axes.grid(&decades, |t| number(10_f64.powf(t)));
+    s += &axes.bottom_axis(&ticks(0.0, last, 6.0), number, "step");
+    s += &axes.side_name(16.0, "loss");
+    let mut entries = vec![];
+    for (i, (name, points)) in [("training", train), ("held-out episodes", held_out)].into_iter().enumerate()
+    {
+        if points.is_empty() {
+            continue;
+        }
+        let line = points.iter().map(|p| (p.0, log(p.1)));
+        s += &axes.line(line, &format!("stroke=\"{}\" stroke-width=\"2\"", colour(i)));
+        entries.push((name.to_owned(), colour(i).to_owned()));
+    }
+    let (keys, taken) = legend(&entries, axes.left, axes.bottom() + 62.0, axes.width);
+    document(WIDTH, axes.bottom() + 54.0 + taken, "Loss by step", &(s + &keys))
+}
+
 fn panel(
     runs: &[&RunResults],
     left: f64,

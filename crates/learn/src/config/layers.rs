@@ -5,7 +5,7 @@ use e2h_core::nearest;
 use toml::{Table, Value};
 
 /// The text of this name.
-pub(super) fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str> {
+pub(crate) fn find<'a>(what: &str, name: &str, known: &[(&str, &'a str)]) -> Result<&'a str> {
     known.iter().find(|(n, _)| *n == name).map(|(_, text)| *text).ok_or_else(|| {
         let names: Vec<&str> = known.iter().map(|(n, _)| *n).collect();
         Error::Config(format!("unknown {what} `{name}`; {}", suggestion(name, "", &names)))
@@ -20,7 +20,7 @@ pub(crate) fn suggestion(name: &str, prefix: &str, known: &[&str]) -> String {
     }
 }
 
-pub(super) fn parse(name: &str, text: &str) -> Result<Table> {
+pub(crate) fn parse(name: &str, text: &str) -> Result<Table> {
     text.parse::<Table>().map_err(|e| Error::Config(format!("{name}: {}", e.message())))
 }
 
@@ -28,12 +28,12 @@ pub(super) fn parse(name: &str, text: &str) -> Result<Table> {
 const MOVED: [(&str, &str); 1] = [("train.step.adam.lr", "train.step.schedule.lr")];
 
 /// A table inside a table, if there is one.
-pub(super) fn inner<'a>(table: Option<&'a Value>, key: &str) -> Option<&'a Table> {
+pub(crate) fn inner<'a>(table: Option<&'a Value>, key: &str) -> Option<&'a Table> {
     table?.get(key)?.as_table()
 }
 
 /// The layer that one `key.path=value` lays over a configuration.
-pub(super) fn layer(text: &str) -> Result<Table> {
+pub(crate) fn layer(text: &str) -> Result<Table> {
     let (key, value) = text
         .split_once('=')
         .ok_or_else(|| Error::Config(format!("--set: expected key=value, got `{text}`")))?;
@@ -54,7 +54,7 @@ pub(super) fn layer(text: &str) -> Result<Table> {
 }
 
 /// Lays `over` onto `base`; a key that `base` does not have is unknown, because presets state every entry.
-pub(super) fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
+pub(crate) fn merge(base: &mut Table, over: &Table, path: &str) -> Result<()> {
     for (key, value) in over {
         let full = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
         let Some(slot) = base.get_mut(key) else {

@@ -230,7 +230,8 @@ pub fn obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
 }
 
 /// The same of the network alone, whatever goes into it.
-pub(super) fn network_obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
+#[must_use]
+pub fn network_obstacles(c: &PolicyConfig) -> Vec<Obstacle> {
     let mut found = vec![];
     let mut ask = |ok: bool, setting: &str, expected: String, is: String| {
         if !ok {

@@ -25,7 +25,7 @@ mod policy;
 mod processors;
 mod scaling;
 
-pub use description::{Obstacle, obstacles};
+pub use description::{Obstacle, network_obstacles, obstacles};
 pub use export::{Exported, HEADER, export, save};
 pub use features::Features;
 pub use import::import;

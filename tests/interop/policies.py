@@ -108,6 +108,20 @@ def ours(program, checkpoint, published):
           f"difference {worst:.1e} at most, actions span {span:.2f}")
 
 
+def trained(program, root):
+    """A policy that `train` made of a dataset of any robot: LeRobot opens it strictly and acts as we do."""
+    work = Path(root).parent
+    config = open_policy(root).config
+    worst = 0.0
+    for seed in range(3):
+        inputs = draw(config, root, seed)
+        policy, actions = act(root, inputs)
+        worst = max(worst, same("trained", rust(program, "theirs", root, inputs, work), actions))
+    span = (actions.max(0).values - actions.min(0).values).max().item()
+    print(f"LeRobot opened {sum(p.numel() for p in policy.parameters())} parameters, {len(inputs['state'][0])} numbers of state, "
+          f"{actions.shape[1]} of action, and acted the same: difference {worst:.1e} at most, actions span {span:.2f}")
+
+
 def feature(kind, *shape):
     return PolicyFeature(type=kind, shape=shape)
 
@@ -157,4 +171,4 @@ def theirs(program, export, work):
 
 
 if __name__ == "__main__":
-    {"ours": ours, "theirs": theirs}[sys.argv[1]](*sys.argv[2:])
+    {"ours": ours, "theirs": theirs, "trained": trained}[sys.argv[1]](*sys.argv[2:])

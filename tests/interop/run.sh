@@ -30,7 +30,7 @@ if ! cmp --silent "$here/requirements.txt" "$environment/installed.txt"; then
 fi
 
 cd "$root"
-cargo build --release --quiet --locked --example interop --example dataset --example refine --example lerobot_actions --example export
+cargo build --release --quiet --locked --example interop --example dataset --example refine --example lerobot_actions --example export --example train
 programs="${CARGO_TARGET_DIR:-$root/target}/release/examples"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
@@ -66,6 +66,16 @@ lerobot compare "$programs/interop" "$work/refined"
 lerobot statistics "$work/refined"
 lerobot refined "$work/theirs" "$work/refined"
 lerobot train "$work/refined"
+
+echo "== a policy that is trained here on that opens in LeRobot, and so does one of the recording itself"
+for dataset in refined theirs; do
+    "$programs/train" --dataset "$work/$dataset" --preset smoke --quiet --set data.validation=0.3 --set data.resize=[48,64] \
+        --out "$work/trained-$dataset"
+    # The check writes beside the folder that it is given.
+    cp -rL "$work/trained-$dataset/checkpoints/last/pretrained_model" "$work/trained"
+    policies trained "$programs/lerobot_actions" "$work/trained"
+    rm -r "$work/trained"
+done
 
 echo "== we go on with a dataset of LeRobot's"
 "$programs/interop" append "$work/theirs"

@@ -201,7 +201,7 @@ async fn listen(listener: TcpListener, shared: Arc<Shared>) {
         let service = TowerToHyperService::new(router.clone());
         tokio::spawn(async move {
             let mut http = hyper::server::conn::http1::Builder::new();
-            http.timer(TokioTimer::new()).header_read_timeout(HEADERS).keep_alive(false);
+            http.timer(TokioTimer::new()).header_read_timeout(HEADERS);
             // What breaks here is a client's connection before it is one of the protocol.
             let served = http.serve_connection(TokioIo::new(stream), service).with_upgrades();
             let _ = tokio::time::timeout(HEADERS * 2, served).await;

@@ -100,6 +100,10 @@ async fn converse(
             Ok(None) => return Err(None),
             Ok(Some(Ok(message))) => message,
             Ok(Some(Err(error))) => {
+                let error = error.into_inner();
+                if error.downcast_ref().is_some_and(cut_off) {
+                    return Err(None);
+                }
                 let most = settings.max_message;
                 let expected = format!("one of the websocket protocol, of at most {most} bytes");
                 return Err(Some(Error::mismatch("message", expected, error.to_string())));
@@ -120,6 +124,13 @@ async fn converse(
             return Ok(());
         }
     }
+}
+
+/// Whether a client has gone without a word.
+fn cut_off(error: &tungstenite::Error) -> bool {
+    use tungstenite::Error::{AlreadyClosed, ConnectionClosed, Io, Protocol};
+    use tungstenite::error::ProtocolError::ResetWithoutClosingHandshake;
+    matches!(error, Io(_) | ConnectionClosed | AlreadyClosed | Protocol(ResetWithoutClosingHandshake))
 }
 
 /// Sends bytes to a client that takes them; one that does not has gone.

@@ -48,8 +48,8 @@ pub struct Metadata {
     pub task: Option<String>,
     /// Which task of the pair it does.
     pub direction: Option<String>,
-    /// Preset of the run that trained it.
-    pub preset: Option<String>,
+    /// Configuration of the run that trained it, JSON.
+    pub run: Option<String>,
     /// Its cameras, if it names them.
     pub cameras: Option<Vec<Camera>>,
     /// Observations of a history.
@@ -92,7 +92,7 @@ impl Metadata {
             kind: text(value, "kind"),
             task: text(value, "task"),
             direction: text(value, "direction"),
-            preset: value.get("provenance").and_then(|p| text(p, "preset")),
+            run: value.get("provenance").and_then(|p| text(p, "run")),
             cameras,
             n_obs_steps,
             stream: value.get(STREAM) == Some(&Value::Bool(true)),
@@ -137,11 +137,17 @@ impl RemotePolicy {
         &self.metadata
     }
 
-    /// Names the cameras of the observations that will come, in order.
-    #[must_use]
-    pub fn with_cameras(mut self, cameras: Vec<String>) -> Self {
-        self.settings.cameras = cameras;
-        self
+    /// The same for observations of these cameras, in order, over so many connections.
+    ///
+    /// # Errors
+    /// When the server does not take that many.
+    pub fn prepare(mut self, cameras: &[String], connections: usize) -> Result<Self> {
+        self.settings.cameras = cameras.to_vec();
+        let sockets = self.sockets.get_mut().unwrap_or_else(std::sync::PoisonError::into_inner);
+        while sockets.len() < connections {
+            sockets.push(open(&self.settings)?.0);
+        }
+        Ok(self)
     }
 
     fn request(&self, history: &[&Observation], rng: &mut Rng) -> Result<Vec<u8>> {

@@ -74,12 +74,16 @@ impl Inputs {
         if let Some(p) = &self.provenance {
             all.push(("task", p.task.as_str().into()));
             all.extend(p.direction.map(|d| ("direction", d.name().into())));
-            let origin = [
+            let mut origin = vec![
                 ("preset", Value::from(p.preset.as_str())),
                 ("seed", p.seed.into()),
                 ("iteration", u64::from(p.iteration).into()),
                 ("version", p.version.as_str().into()),
             ];
+            if !p.run.is_null() {
+                // So that an evaluation can rebuild the environment, as it does from the checkpoint itself.
+                origin.push(("run", Value::Text(p.run.to_string())));
+            }
             all.push(("provenance", Value::map(origin)));
         }
         Value::map(all)

@@ -122,7 +122,7 @@ impl Client {
     pub(crate) fn error(&mut self) -> String {
         let words = match self.receive() {
             Message::Text(words) => words.to_string(),
-            other => panic!("expected an error, got {other:?}"),
+            other => panic!("expected an error, got {} bytes of another kind", other.len()),
         };
         match self.receive() {
             Message::Close(Some(frame)) => assert_eq!(u16::from(frame.code), 1011),

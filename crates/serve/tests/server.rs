@@ -1,8 +1,9 @@
 //! A server and its clients: nothing is lost or mixed up, and nobody harms another.
 
 use crate::common::{Client, Slow, actions, direct, entries, message, metric, page, policy, seen, settings};
+use e2h_core::Rng;
 use e2h_serve::wire::{Array, Value};
-use e2h_serve::{Error, Inputs, Server, Settings, Token};
+use e2h_serve::{Error, Inputs, Seen, Servable, Server, Settings, Token};
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpStream};
 use std::time::{Duration, Instant};
@@ -252,4 +253,62 @@ fn what_is_no_protocol_is_left() {
     assert!(answer.is_empty() || answer.starts_with(b"HTTP/1.1 400"), "{answer:?}");
     let mut client = Client::new(&server);
     assert!(!actions(&client.infer(&asked(1, 1, server.inputs()))).is_empty());
+}
+
+/// A policy that some observations are too much for.
+struct Brittle(e2h_policy::DiffusionPolicy);
+
+impl Servable for Brittle {
+    fn inputs(&self) -> Inputs {
+        self.0.inputs()
+    }
+
+    fn act(&self, histories: Vec<Vec<Seen>>, rngs: &mut [Rng]) -> e2h_serve::Result<Vec<Vec<Vec<f32>>>> {
+        std::thread::sleep(Duration::from_millis(30));
+        let first: Vec<f32> = histories.iter().map(|h| h[0].state[0]).collect();
+        assert!(!first.contains(&100.0), "too much");
+        let mut chunks = self.0.act(histories, rngs)?;
+        for (chunk, state) in chunks.iter_mut().zip(first) {
+            if state > 150.0 {
+                chunk[0][0] = f32::NAN;
+            }
+        }
+        Ok(chunks)
+    }
+}
+
+#[test]
+fn an_observation_that_breaks_the_policy_spoils_no_answer_of_others() {
+    let server = Server::start(Box::new(Brittle(policy(&[]))), settings()).unwrap();
+    let inputs = server.inputs().clone();
+    let reference = policy(&[]);
+    std::thread::scope(|scope| {
+        for c in 0..6_u64 {
+            let server = &server;
+            scope.spawn(move || {
+                for i in 0..4_u16 {
+                    let mut client = Client::new(server);
+                    let mut state = [0.0; 15];
+                    state[0] = 100.0 * f32::from(1 + i % 3);
+                    client.send(Value::map([("state", Array::f32(&[15], &state).into())]).encode());
+                    let words = client.error();
+                    let expected = if i % 3 == 0 { "it panicked" } else { "expected finite actions" };
+                    assert!(
+                        words.contains("the policy gave no answer") && words.contains(expected),
+                        "{c}: {words}"
+                    );
+                }
+            });
+        }
+        let expected: Vec<Vec<f32>> = (0..12).map(|k| direct(&reference, k, k)).collect();
+        let mut client = Client::new(&server);
+        for (k, expected) in (0..).zip(&expected) {
+            assert_eq!(actions(&client.infer(&asked(k, k, &inputs))), *expected);
+        }
+    });
+    // Some calls were of several, or nothing was put to the test.
+    assert!(
+        metric(&server, "e2h_serve_batch_size_bucket{le=\"1\"}")
+            < metric(&server, "e2h_serve_batch_size_count")
+    );
 }

@@ -11,6 +11,7 @@ mod front_door; // what `cargo run` lists, and what every example says of itself
 mod imitation; // `train` on datasets of a robot that this project does not know
 mod pipeline; // refinement, critic and update on scripted rollouts
 mod resume;
+mod served; // a policy behind a socket: the results of its checkpoint, and who may ask
 mod tr_drl; // reinforcement learning from states, its loop and its record // kills at random instants, and thread counts: the same bytes
 
 use std::path::{Path, PathBuf};

@@ -83,6 +83,12 @@ impl LerobotPolicy {
         self.config.horizon
     }
 
+    /// Actions that it returns at once.
+    #[must_use]
+    pub fn n_action_steps(&self) -> usize {
+        self.config.n_action_steps
+    }
+
     /// Where it comes from, when this project wrote the folder.
     #[must_use]
     pub fn provenance(&self) -> Option<&Provenance> {

@@ -150,3 +150,33 @@ fn train_lists_all_that_does_not_fit_before_any_work() {
     assert!(refused(&[format!("{a}:0")], &[]).contains("share above 0"));
     assert!(refused(&["nowhere".to_owned()], &[]).contains("nowhere"));
 }
+
+/// The worked example, at a size at which nothing is learned: every step of REAL_ROBOT.md runs, and the trials are counted.
+#[test]
+fn a_robot_of_ones_own_goes_from_its_recordings_to_a_served_policy() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("all");
+    let run = || {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/real_robot/run.sh");
+        let programs = PathBuf::from(example("train").get_program());
+        let mut command = Command::new(script);
+        command.env("E2H_PROGRAMS", programs.parent().unwrap()).arg(&out);
+        command.args(["--preset", "smoke", "--episodes", "3", "--trials", "2"]).output().unwrap()
+    };
+    let output = run();
+    assert_success(&output);
+    let printed = text(&output.stdout);
+    assert!(printed.contains("3 of 3 recordings accepted"), "{printed}");
+    assert!(printed.contains("of 2 trials succeeded, 95 % Wilson interval"), "{printed}");
+    assert!(std::fs::read(out.join("trials.png")).unwrap().starts_with(b"\x89PNG"));
+    let refined = auto_e2h::data::lerobot::Dataset::open(out.join("refined")).unwrap();
+    assert_eq!((refined.len(), refined.info().fps), (3, 15.0));
+    // Goals of the last frames are those of a plug in its socket: the hand has gone up over it, the jaws are open.
+    let table = refined.read_columns(0, &["action"]).unwrap();
+    let last = &table.f32("action").unwrap()[table.rows * 8 - 8..];
+    assert!((last[0] - 0.3).abs() < 0.02 && last[1].abs() < 0.02 && last[7] == 1.0, "{last:?}");
+    // The same command goes on: what is there is not made again.
+    let again = run();
+    assert_success(&again);
+    assert_eq!(text(&again.stdout).lines().last(), printed.lines().last());
+}

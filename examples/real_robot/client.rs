@@ -1,9 +1,9 @@
 //! The robot's side of serving: what its driver does with a policy server.
 
 use crate::record::place;
-use crate::robot::{HZ, IMAGE, OPEN, Robot};
+use crate::robot::{HZ, OPEN, Robot};
 use anyhow::{Context as _, ensure};
-use auto_e2h::core::{say, stream};
+use auto_e2h::core::{Image, Outcome, say, stream};
 use auto_e2h::report::animation;
 use auto_e2h::report::record::wilson95;
 use auto_e2h::serve::wire::{Array, Value};
@@ -27,7 +27,7 @@ const FILMED: usize = 6;
 #[derive(Clone)]
 struct Seen {
     state: [f32; STATE],
-    image: Vec<u8>,
+    image: Image,
 }
 
 fn look(robot: &Robot) -> Seen {
@@ -44,7 +44,7 @@ fn look(robot: &Robot) -> Seen {
 /// Runs `trials` and says how many succeeded.
 pub(crate) fn run(server: &str, trials: usize, seed: u64, video: Option<&Path>) -> anyhow::Result<()> {
     ensure!(trials > 0, "--trials: expected at least 1, got 0");
-    let mut client = Client::connect(&ClientSettings::new(server)).context("is the server of step 5 running?")?;
+    let mut client = Client::connect(&ClientSettings::new(server)).context("is the server running?")?;
     let history = client.metadata().get("n_obs_steps").and_then(Value::as_usize).unwrap_or(1);
     let width = client.metadata().get("state_width").and_then(Value::as_usize);
     ensure!(
@@ -58,7 +58,8 @@ pub(crate) fn run(server: &str, trials: usize, seed: u64, video: Option<&Path>) 
         let mut film = (video.is_some() && trial < FILMED).then(Vec::new);
         let success = one(&mut client, &mut robot, history, seed + trial as u64, film.as_mut())?;
         done += usize::from(success);
-        films.extend(film.map(|frames| (success, frames)));
+        let outcome = if success { Outcome::Success { at: 0 } } else { Outcome::Timeout };
+        films.extend(film.map(|frames| (outcome, frames)));
         say(format_args!("trial {trial}: {}", if success { "the plug is in" } else { "failed" }))?;
     }
     if let Some(path) = video {
@@ -78,7 +79,7 @@ fn one(
     robot: &mut Robot,
     history: usize,
     seed: u64,
-    mut film: Option<&mut Vec<auto_e2h::core::Image>>,
+    mut film: Option<&mut Vec<Image>>,
 ) -> anyhow::Result<bool> {
     // Control steps of the robot to one of the policy.
     let ticks = (HZ / POLICY_HZ).round() as usize;
@@ -90,7 +91,7 @@ fn one(
         }
         let Some([x, y, z, jaw]) = chunk.pop_front() else { break };
         if let Some(film) = film.as_mut().filter(|_| steps % 3 == 0) {
-            film.push(auto_e2h::core::Image { height: IMAGE.0, width: IMAGE.1, data: robot.image() });
+            film.push(robot.image());
         }
         for _ in 0..ticks {
             robot.step([x, y, z], jaw);
@@ -109,10 +110,11 @@ fn one(
 /// The next goals, in the robot's own units: x, y, z and jaws, mm.
 fn ask(client: &mut Client, seen: &VecDeque<Seen>, seed: u64) -> anyhow::Result<VecDeque<[f64; 4]>> {
     let states: Vec<f32> = seen.iter().flat_map(|s| s.state).collect();
-    let images: Vec<u8> = seen.iter().flat_map(|s| s.image.iter().copied()).collect();
+    let images: Vec<Array> = seen.iter().map(|s| Array::image(&s.image)).collect();
+    let images = Array::stack(&images).context("no picture")?;
     let request = Value::map([
         ("observation/state", Array::f32(&[seen.len(), STATE], &states).into()),
-        ("observation/images/above", Array::u8(&[seen.len(), IMAGE.0, IMAGE.1, 3], &images).into()),
+        ("observation/images/above", images.into()),
         ("prompt", "plug it in".into()),
         ("seed", seed.into()),
     ]);

@@ -42,7 +42,8 @@ pub(crate) fn record(root: &Path, episodes: usize, seed: u64) -> anyhow::Result<
         writer.push(&table, "pull the plug out")?;
         say(format_args!("episode {episode}: {} rows, {seconds:.1} s", table.rows))?;
     }
-    Ok(writer.finish()?)
+    writer.finish()?;
+    Ok(())
 }
 
 fn demonstration(rng: &mut Rng) -> anyhow::Result<(Table, bool)> {
@@ -70,7 +71,7 @@ fn demonstration(rng: &mut Rng) -> anyhow::Result<(Table, bool)> {
         // Datasets hold 32 bits.
         poses.extend(robot.hand.map(|v| (v / 1000.0) as f32));
         actions.extend([goal[0], goal[1], goal[2], jaw].map(|v| v as f32));
-        images.push(encode_png(IMAGE.0, IMAGE.1, &robot.image())?);
+        images.push(encode_png(IMAGE.0, IMAGE.1, &robot.image().data)?);
         robot.step(goal, jaw);
         Ok(())
     };
@@ -86,7 +87,10 @@ fn demonstration(rng: &mut Rng) -> anyhow::Result<(Table, bool)> {
                 break;
             }
         }
-        for _ in 0..pause + rng.random_range(0..8) {
+        // Now and then for more than a second: that is what the kinematic filter is for.
+        let thinks =
+            if rng.random::<f64>() < 0.3 { rng.random_range(25..50) } else { rng.random_range(0..8) };
+        for _ in 0..pause + thinks {
             row(&mut robot, goal, jaw)?;
         }
     }

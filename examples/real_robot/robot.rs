@@ -2,6 +2,8 @@
 //!
 //! A gantry with a two-finger gripper stands over a table with a socket. The plug is in the socket or lies on the table.
 
+use auto_e2h::core::Image;
+
 /// Control steps a second, Hz.
 pub(crate) const HZ: f64 = 30.0;
 /// Rows and columns of the camera.
@@ -115,7 +117,7 @@ impl Robot {
     ///
     /// # Shapes
     /// (48, 64, 3)
-    pub(crate) fn image(&self) -> Vec<u8> {
+    pub(crate) fn image(&self) -> Image {
         let (rows, columns) = IMAGE;
         let mut pixels: Vec<u8> = [222, 216, 205].repeat(rows * columns);
         let mut square = |x: f64, y: f64, half: f64, hole: f64, colour: [u8; 3]| {
@@ -135,6 +137,6 @@ impl Robot {
         square(self.plug[0], self.plug[1], 15.0, 0.0, [196, 48, 40]);
         let size = 18.0 + 0.12 * self.hand[2];
         square(self.hand[0], self.hand[1], size, size - 9.0, [40, 72, 190]);
-        pixels
+        Image { height: rows, width: columns, data: pixels }
     }
 }

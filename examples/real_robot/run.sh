@@ -49,7 +49,7 @@ echo "== 5. serve"
 server=$!
 trap 'kill "$server" 2> /dev/null || true; wait "$server" 2> /dev/null || true' EXIT
 for _ in $(seq 300); do
-    address="$(grep -o 'ws://[0-9.:]*' "$out/server.log" | head -n 1 || true)"
+    address="$(grep -o 'ws://[0-9.]*:[0-9]*' "$out/server.log" | head -n 1 || true)"
     [ -n "$address" ] && break
     kill -0 "$server" 2> /dev/null || { cat "$out/server.log" >&2; exit 1; }
     sleep 0.1

@@ -34,6 +34,7 @@
 //! Other keys, such as `prompt`, are passed over. Without a history the observation counts for every step of it. An answer has
 //! `actions` (Ta, A), `server_timing` (`infer_ms`, `prev_total_ms`) and the `seed` it was made with.
 
+mod client;
 mod error;
 mod inference;
 mod metrics;
@@ -45,6 +46,7 @@ mod session;
 mod token;
 pub mod wire;
 
+pub use client::{Client, ClientSettings};
 pub use error::{Error, Result};
 pub use remote::{Metadata, RemotePolicy, RemoteSettings};
 pub use request::Request;

@@ -100,7 +100,7 @@ impl Metadata {
     }
 }
 
-type Socket = WebSocket<TcpStream>;
+pub(crate) type Socket = WebSocket<TcpStream>;
 
 /// A server as a policy of this project's: 15 numbers of state, 8 of action, the environment's images.
 ///
@@ -236,12 +236,12 @@ impl Policy for RemotePolicy {
     }
 }
 
-fn socket_error(url: &str, doing: &'static str, source: tungstenite::Error) -> Error {
+pub(crate) fn socket_error(url: &str, doing: &'static str, source: tungstenite::Error) -> Error {
     Error::Socket { url: url.to_owned(), doing, source: Box::new(source) }
 }
 
 /// The next message; words where actions should be are the server's error.
-fn receive(socket: &mut Socket, url: &str) -> Result<Value> {
+pub(crate) fn receive(socket: &mut Socket, url: &str) -> Result<Value> {
     loop {
         match socket.read().map_err(|e| socket_error(url, "waiting for an answer", e))? {
             Message::Binary(bytes) => return Value::decode(&bytes),
@@ -259,10 +259,14 @@ fn receive(socket: &mut Socket, url: &str) -> Result<Value> {
 
 /// A connection, and the first message of the server.
 fn open(settings: &RemoteSettings) -> Result<(Socket, Value)> {
-    let url = &settings.url;
+    dial(&settings.url, settings.token.as_ref(), settings.patience)
+}
+
+/// The same for a server at `url`.
+pub(crate) fn dial(url: &str, token: Option<&Token>, patience: Duration) -> Result<(Socket, Value)> {
     let failed = |doing: &'static str| move |source| socket_error(url, doing, source);
     let io = |e| failed("connecting")(tungstenite::Error::Io(e));
-    let mut request = url.as_str().into_client_request().map_err(failed("reading the address"))?;
+    let mut request = url.into_client_request().map_err(failed("reading the address"))?;
     let address = |e| failed("reading the address")(e);
     match uri_mode(request.uri()).map_err(address)? {
         tungstenite::stream::Mode::Plain => {}
@@ -276,7 +280,7 @@ fn open(settings: &RemoteSettings) -> Result<(Socket, Value)> {
     }
     let host = request.uri().host().unwrap_or_default().trim_matches(['[', ']']).to_owned();
     let port = request.uri().port_u16().unwrap_or(PORT);
-    if let Some(token) = &settings.token {
+    if let Some(token) = token {
         let value = HeaderValue::from_str(&token.header()).map_err(|e| {
             failed("writing the token")(tungstenite::Error::from(tungstenite::http::Error::from(e)))
         })?;
@@ -295,8 +299,8 @@ fn open(settings: &RemoteSettings) -> Result<(Socket, Value)> {
     }
     let stream = stream.ok_or_else(|| io(last))?;
     stream.set_nodelay(true).map_err(io)?;
-    stream.set_read_timeout(Some(settings.patience)).map_err(io)?;
-    stream.set_write_timeout(Some(settings.patience)).map_err(io)?;
+    stream.set_read_timeout(Some(patience)).map_err(io)?;
+    stream.set_write_timeout(Some(patience)).map_err(io)?;
     let config = WebSocketConfig::default();
     let (mut socket, _) =
         tungstenite::client::client_with_config(request, stream, Some(config)).map_err(|e| match e {

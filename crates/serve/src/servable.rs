@@ -166,17 +166,23 @@ impl Servable for LerobotPolicy {
             name.strip_prefix("images.").unwrap_or(name).to_owned()
         };
         let camera = |name: &str| Camera { name: short(name), height, width };
+        // What `train` wrote of the datasets it learned from; other folders do not say.
+        let known = |key: &str| self.provenance().and_then(|p| p.run.get(key));
+        let names = |key: &str| -> Vec<String> {
+            let list = known(key).and_then(serde_json::Value::as_array);
+            list.into_iter().flatten().filter_map(|v| Some(v.as_str()?.to_owned())).collect()
+        };
         Inputs {
             kind: "lerobot diffusion".to_owned(),
             state: self.state_dim(),
-            state_names: vec![],
+            state_names: names("state"),
             environment: self.environment_dim(),
             cameras: self.cameras().map(camera).collect(),
             n_obs_steps: self.n_obs_steps(),
             n_action_steps: self.n_action_steps(),
             action: self.action_dim(),
-            action_names: vec![],
-            control_hz: None,
+            action_names: names("action"),
+            control_hz: known("fps").and_then(serde_json::Value::as_f64),
             provenance: self.provenance().cloned(),
         }
     }

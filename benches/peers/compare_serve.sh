@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Latency of one and of eight clients: `serve`, and openpi's own server around the same network of LeRobot's in torch. In turn on this
-# machine, two threads each; the clients are openpi's.
+# machine, one thread each; the clients are openpi's.
 #
 #   benches/peers/compare_serve.sh [--rounds N]
 #
@@ -22,28 +22,26 @@ fi
 # The server alone: its package would bring JAX.
 mkdir -p "$here/openpi/openpi/serving"
 cp "$server" "$here/openpi/openpi/serving/"
-export PYTHONPATH="$PWD/$here/openpi" HF_HUB_OFFLINE=1 CUDA_VISIBLE_DEVICES=""
+export PYTHONPATH="$PWD/$here/openpi" HF_HUB_OFFLINE=1 CUDA_VISIBLE_DEVICES="" OMP_NUM_THREADS=1
 cargo build --quiet --release --example serve
 [ -e "$here/served/config.json" ] || "$python" -W ignore benches/peers/serve.py make "$here/served" 2> /dev/null
 
 running=""
 trap '[ -z "$running" ] || kill "$running"' EXIT
 measure() {
-    local who=$1 port=$2 ready=$3
-    shift 3
+    local who=$1 port=$2
+    shift 2
     "$@" > "$here/serve.log" 2>&1 &
     running=$!
-    until grep -q "$ready" "$here/serve.log"; do kill -0 "$running"; sleep 0.2; done
-    # It says so just before it listens.
-    sleep 1
+    until curl --silent --fail "http://127.0.0.1:$port/healthz" > /dev/null; do kill -0 "$running"; sleep 0.2; done
     for clients in 1 8; do
-        echo "{\"server\":\"$who\"} $("$python" -W ignore benches/peers/serve.py load "$port" "$clients" $((clients == 1 ? 60 : 20)))"
+        echo "{\"server\":\"$who\"} $("$python" -W ignore benches/peers/serve.py load "$port" "$clients" $((clients == 1 ? 20 : 5)))"
     done
     kill "$running"
     wait "$running" || true
     running=""
 }
 for _ in $(seq "$rounds"); do
-    measure openpi 18431 ready "$python" -W ignore benches/peers/serve.py serve "$here/served" 18431
-    measure ours 18432 ws:// target/release/examples/serve --checkpoint "$here/served" --listen 127.0.0.1:18432 --threads 2
+    measure openpi 18431 "$python" -W ignore benches/peers/serve.py serve "$here/served" 18431
+    measure ours 18432 target/release/examples/serve --checkpoint "$here/served" --listen 127.0.0.1:18432 --threads 1
 done

@@ -60,7 +60,7 @@ def serve(root, port):
     from lerobot.policies.factory import make_pre_post_processors
     from openpi.serving.websocket_policy_server import WebsocketPolicyServer
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)
     policy = DiffusionPolicy.from_pretrained(root)
     policy.eval()
     before, after = make_pre_post_processors(policy.config, pretrained_path=str(root))
@@ -80,7 +80,6 @@ def serve(root, port):
             actions = after(policy.diffusion.generate_actions(history)[:, :ahead])
             return {"actions": actions[0].numpy()}
 
-    print("ready", flush=True)
     WebsocketPolicyServer(Served(), host="127.0.0.1", port=int(port)).serve_forever()
 
 
@@ -93,8 +92,9 @@ def client(port, seed, count, start, out):
         "observation/state": random.uniform(-1, 1, STATE).astype(np.float32),
         **{f"observation/{name}": random.integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8) for name in CAMERAS},
     }
-    for _ in range(3):
-        policy.infer(observation)
+    # Openpi's server shakes no hands while it thinks: all are there before the first asks.
+    start.wait()
+    policy.infer(observation)
     start.wait()
     times = []
     for _ in range(count):
@@ -110,6 +110,7 @@ def load(port, clients, count):
     all_of_them = [multiprocessing.Process(target=client, args=(port, c, count, start, out)) for c in range(clients)]
     for process in all_of_them:
         process.start()
+    start.wait()
     start.wait()
     begin = time.perf_counter()
     times = np.sort(np.concatenate([out.get() for _ in all_of_them])) * 1e3

@@ -83,26 +83,23 @@ fn a_thousand_requests_of_eight_clients_among_faulty_ones_get_their_own_answers(
 
 #[test]
 fn those_who_wait_are_answered_together() {
-    let slow = Slow(policy(&[]), Duration::from_millis(50));
+    let slow = Slow(policy(&[]), Duration::from_millis(400));
     let server = Server::start(Box::new(slow), Settings { max_batch: 4, ..settings() }).unwrap();
     let inputs = server.inputs().clone();
-    std::thread::scope(|scope| {
-        for c in 0..8 {
-            let (server, inputs) = (&server, &inputs);
-            scope.spawn(move || {
-                let mut client = Client::new(server);
-                for i in 0..4 {
-                    client.infer(&asked(c, i, inputs));
-                }
-            });
-        }
-    });
+    let mut clients: Vec<Client> = (0..9).map(|_| Client::new(&server)).collect();
+    for (c, client) in (0..).zip(&mut clients) {
+        client.send(asked(c, c, &inputs).encode());
+    }
+    for (c, client) in (0..).zip(&mut clients) {
+        let tungstenite::Message::Binary(answer) = client.receive() else { panic!("no answer") };
+        assert_eq!(actions(&Value::decode(&answer).unwrap()), direct(&policy(&[]), c, c));
+    }
+    // While the first ones are answered all others arrive: they take two calls, or three.
     let calls = metric(&server, "e2h_serve_batch_size_count");
-    assert_eq!(metric(&server, "e2h_serve_batch_size_sum"), 32.0);
-    assert!((8.0..=20.0).contains(&calls), "{calls} calls for 32 requests, at most 4 in one");
-    let over = metric(&server, "e2h_serve_batch_size_bucket{le=\"4\"}");
-    assert_eq!(over, calls, "a call with more than 4");
-    assert_eq!(metric(&server, "e2h_serve_latency_seconds_count"), 32.0);
+    assert!((3.0..=4.0).contains(&calls), "{calls} calls for 9 requests, at most 4 in one");
+    assert_eq!(metric(&server, "e2h_serve_batch_size_sum"), 9.0);
+    assert_eq!(metric(&server, "e2h_serve_batch_size_bucket{le=\"4\"}"), calls, "a call with more than 4");
+    assert_eq!(metric(&server, "e2h_serve_latency_seconds_count"), 9.0);
 }
 
 #[test]
@@ -180,7 +177,7 @@ fn others_machines_are_let_in_with_a_token_alone() {
 #[test]
 fn messages_clients_and_silence_have_limits() {
     let limits =
-        Settings { max_message: 1 << 16, max_clients: 3, idle: Duration::from_millis(400), ..settings() };
+        Settings { max_message: 1 << 16, max_clients: 3, idle: Duration::from_secs(2), ..settings() };
     let server = Server::start(Box::new(policy(&[])), limits).unwrap();
     let inputs = server.inputs().clone();
     let mut large = Client::new(&server);
@@ -202,9 +199,9 @@ fn messages_clients_and_silence_have_limits() {
     let refused = Client::with(server.address(), None).err().unwrap();
     assert!(refused.contains("503"), "{refused}");
     third.infer(&asked(0, 0, &inputs));
-    assert!(silent.error().contains("within 400ms"));
-    assert!(half.error().contains("within 400ms"));
-    assert!(start.elapsed() >= Duration::from_millis(400));
+    assert!(silent.error().contains("within 2s"));
+    assert!(half.error().contains("within 2s"));
+    assert!(start.elapsed() >= Duration::from_secs(2));
 }
 
 #[test]
@@ -220,14 +217,14 @@ fn an_answer_that_takes_too_long_is_an_error() {
 
 #[test]
 fn a_server_that_stops_answers_first_and_says_goodbye() {
-    let slow = Slow(policy(&[]), Duration::from_millis(300));
+    let slow = Slow(policy(&[]), Duration::from_millis(1500));
     let server = Server::start(Box::new(slow), settings()).unwrap();
     let inputs = server.inputs().clone();
     let address = server.address();
     let mut idle = Client::new(&server);
     let mut busy = Client::new(&server);
     busy.send(asked(5, 9, &inputs).encode());
-    std::thread::sleep(Duration::from_millis(100));
+    std::thread::sleep(Duration::from_millis(500));
     let stopping = std::thread::spawn(move || server.stop());
     let tungstenite::Message::Binary(answer) = busy.receive() else { panic!("no answer") };
     assert_eq!(actions(&Value::decode(&answer).unwrap()), direct(&policy(&[]), 5, 9));

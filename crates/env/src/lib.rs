@@ -38,7 +38,7 @@ pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
 pub use env::{CAMERAS, Env, Snapshot};
 pub use expert::{Expert, Phase, Script};
 pub use probe::{Blind, Probed, probe};
-pub use record::{demonstrate, replay};
+pub use record::{demonstrate, demonstration_stream, replay};
 pub use render::{MOST_PIXELS, Style};
 pub use scene::{TableCamera, compose, finer};
 pub use sim::{MAX_OPENING, Sim};

@@ -11,6 +11,7 @@ mod front_door; // what `cargo run` lists, and what every example says of itself
 mod given; // demonstrations that a run is given: the same bytes as from its own, refusals, resuming
 mod pipeline; // refinement, critic and update on scripted rollouts
 mod resume; // kills at random instants, and thread counts: the same bytes
+mod teleop; // demonstrations recorded by hand, without a window, and given to a run
 mod tr_drl; // reinforcement learning from states, its loop and its record
 
 use std::path::{Path, PathBuf};

@@ -7,3 +7,4 @@ pub use e2h_nn as nn;
 pub use e2h_policy as policy;
 pub use e2h_refine as refine;
 pub use e2h_report as report;
+pub use e2h_teleop as teleop;

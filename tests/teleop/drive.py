@@ -81,6 +81,8 @@ class Person:
             self.hold(keys)
 
     def shoot(self, name):
+        # What is printed is a picture ahead of what is seen.
+        time.sleep(1)
         subprocess.run(["import", "-window", "root", f"{shots}/{name}.png"], check=True)
 
     def home(self):

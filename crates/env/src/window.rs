@@ -59,7 +59,7 @@ impl Window {
         let vis = model.vis_mut();
         (vis.global.azimuth, vis.global.elevation) = (28.0, -32.0);
         // Shadows show how high the hand is; sharp ones take ten times as long where a CPU draws.
-        vis.quality.shadowsize = 512;
+        vis.quality.shadowsize = 1024;
         (vis.quality.numslices, vis.quality.numstacks) = (16, 8);
         let stat = model.stat_mut();
         (stat.center, stat.extent) = ([0.5, 0.0, 0.12], 0.75);

@@ -422,15 +422,16 @@ mod tests {
         assert!(refused(|r| r[4].results.overrides = vec!["a=1".to_owned()]).contains("found a=1"));
         assert!(refused(|r| r[4].results.variant = "square".to_owned()).contains("variant"));
         assert!(refused(|r| r[4].results.demonstrations = 9).contains("expected 5, found 9"));
-        let given = crate::folder::Given {
-            from: "hand".to_owned(),
-            sha256: "c0ffee".to_owned(),
-            episodes: 5,
-            of: 6,
-            resized: false,
-            seconds: None,
-        };
-        let message = refused(|r| r[4].results.given = Some(given.clone()));
+        let message = refused(|r| {
+            r[4].results.given = Some(crate::folder::Given {
+                from: "hand".to_owned(),
+                sha256: "c0ffee".to_owned(),
+                episodes: 5,
+                of: 6,
+                resized: false,
+                seconds: None,
+            });
+        });
         assert!(message.contains("expected scripted, found c0ffee"), "{message}");
         assert!(refused(|r| r[5].results.seed = 1).contains("two runs of"));
         assert!(refused(|r| r[6].last.outcomes.truncate(39)).contains("expected 40, found 39"));

@@ -305,6 +305,12 @@ fn a_disk_that_refuses_loses_nothing_and_a_folder_of_something_else_is_refused()
     hand.wait(20);
     assert_eq!((hand.session.status().phase, hand.session.status().rows), (Phase::Unsaved, rows));
     std::fs::remove_dir_all(&block).unwrap();
+    // And half way through: the rows are there, and are not counted.
+    let block = out.join("meta/episodes/chunk-000/file-001.parquet");
+    std::fs::create_dir_all(block.join("full")).unwrap();
+    hand.tap(Control::Save);
+    assert_eq!((hand.session.status().phase, read(&out).len()), (Phase::Unsaved, 1));
+    std::fs::remove_dir_all(&block).unwrap();
     hand.tap(Control::Save);
     assert_eq!(hand.session.status().saved, 2, "{:?}", hand.session.status());
     let episodes = read(&out);

@@ -8,11 +8,13 @@ mod errors; // wrong input and trouble with files: a clear message, before any w
 mod examples; // every example binary with the smoke preset
 mod faults; // signals, closed pipes, flipped bits and a MuJoCo that cannot go on
 mod front_door; // what `cargo run` lists, and what every example says of itself
+mod given; // demonstrations that a run is given: the same bytes as from its own, refusals, resuming
 mod imitation; // `train` on datasets of a robot that this project does not know
 mod pipeline; // refinement, critic and update on scripted rollouts
-mod resume;
+mod resume; // kills at random instants, and thread counts: the same bytes
 mod served; // a policy behind a socket: the results of its checkpoint, and who may ask
-mod tr_drl; // reinforcement learning from states, its loop and its record // kills at random instants, and thread counts: the same bytes
+mod teleop; // demonstrations recorded by hand, without a window, and given to a run
+mod tr_drl; // reinforcement learning from states, its loop and its record
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

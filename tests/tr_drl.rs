@@ -21,6 +21,21 @@ fn options(out: &Path, set: &[&str]) -> RunOptions {
     }
 }
 
+/// Demonstrations are played again from where they began, which their own seed draws.
+#[test]
+fn demonstrations_of_a_run_with_another_seed_are_adapted_all_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    let [own, given] = ["own", "given"].map(|n| dir.path().join(n));
+    Run::open(&options(&own, &["loop.iterations=0"])).unwrap().learn().unwrap();
+    let other = RunOptions {
+        seed: 8,
+        demonstrations: Some(own.join("demonstrations")),
+        ..options(&given, &["loop.iterations=0"])
+    };
+    let (results, _) = Run::open(&other).unwrap().learn().unwrap();
+    assert_eq!((results.seed, results.given.unwrap().episodes), (8, 2));
+}
+
 /// The weights that a run of these values ends with.
 fn weights(out: &Path, set: &[&str]) -> Vec<u8> {
     Run::open(&options(out, set)).unwrap().learn().unwrap();

@@ -8,3 +8,4 @@ pub use e2h_policy as policy;
 pub use e2h_refine as refine;
 pub use e2h_report as report;
 pub use e2h_serve as serve;
+pub use e2h_teleop as teleop;

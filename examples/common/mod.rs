@@ -61,6 +61,9 @@ struct Arguments {
     /// Run directory (by default runs/<task>-<preset>-<seed>).
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Easy demonstrations of one's own in place of scripted ones: a LeRobot dataset as runs and `teleop` record it.
+    #[arg(long, value_name = "DIR")]
+    demonstrations: Option<PathBuf>,
     /// Go on with a run directory that exists.
     #[arg(long)]
     resume: bool,
@@ -103,6 +106,7 @@ fn options(task: &str) -> Result<RunOptions> {
         seed: a.seed,
         set,
         out: a.out,
+        demonstrations: a.demonstrations,
         resume: a.resume,
         initial_from: None,
         device: a.device,

@@ -34,6 +34,7 @@ mod error;
 mod file;
 #[cfg(test)]
 mod fixture;
+mod hand_recording;
 pub mod lerobot;
 mod normalise;
 mod recording;
@@ -44,6 +45,7 @@ mod window;
 pub use atomic::write as write_atomic;
 pub use error::{Error, Result};
 pub use file::{MOST_TEXT, MOST_WEIGHTS, read_file, read_regular, read_text};
+pub use hand_recording::{HandRecording, RECORDING_FILE, Take};
 pub use normalise::{Normaliser, NormaliserConfig};
 pub use recording::{
     ACTION_FEATURE, CameraLayout, ENVIRONMENT_FEATURE, Layout, RecordedSource, Recording, STATE_FEATURE,

@@ -32,18 +32,22 @@ mod sim;
 mod tabletop;
 mod task;
 mod tasks;
+#[cfg(feature = "viewer")]
+mod window;
 
 pub use arm::PosturePull;
 pub use config::{DemonstratorConfig, EnvConfig, TaskOptions};
 pub use env::{CAMERAS, Env, Snapshot};
 pub use expert::{Expert, Phase, Script};
 pub use probe::{Blind, Probed, probe};
-pub use record::{demonstrate, replay};
+pub use record::{demonstrate, demonstration_stream, replay};
 pub use render::{MOST_PIXELS, Style};
 pub use scene::{TableCamera, compose, finer};
 pub use sim::{MAX_OPENING, Sim};
 pub use task::Task;
 pub use tasks::*;
+#[cfg(feature = "viewer")]
+pub use window::{Key, Panel, Window};
 
 /// What pick-and-place pairs are made of: regions and pieces of predicates, grasps, and the one script of their demonstrators.
 pub mod toolkit {
@@ -85,6 +89,9 @@ pub enum Error {
     /// The simulation ran away where no episode is recorded; MuJoCo has set it back, and a reset goes on.
     #[error("the simulation diverged: {0}")]
     Diverged(&'static str),
+    /// The window cannot be opened, or cannot draw.
+    #[error("window: {0}")]
+    Window(String),
     /// A scene lacks something that the environment needs.
     #[error("the scene has no {what} `{name}`")]
     Missing {

@@ -1,5 +1,16 @@
 use crate::{DemonstratorConfig, Env, Result};
-use e2h_core::{Action, Direction, Episode, Origin, Outcome, Rng};
+use e2h_core::{Action, Direction, Episode, Origin, Outcome, Rng, stream};
+
+/// The stream from which demonstration `index` of a seed draws its start first: whoever resets an environment with it stands where the
+/// demonstration began.
+#[must_use]
+pub fn demonstration_stream(seed: u64, direction: Direction, index: u32) -> Rng {
+    let purpose = match direction {
+        Direction::Easy => "demonstrate",
+        Direction::Hard => "demonstrate/hard",
+    };
+    stream(seed, purpose, 0, u64::from(index))
+}
 
 /// Records a scripted demonstration from a fresh start: through the whole script, back to home, and
 /// [`DemonstratorConfig::tail`] control steps at rest. The outcome is a success when the goal was held at the end.

@@ -334,6 +334,15 @@ impl RunConfig {
     }
 }
 
+/// Whether an override says `table.key`.
+pub(crate) fn sets(overrides: &[String], table: &str, key: &str) -> bool {
+    let says = |text: &String| {
+        let layer = layer(text).ok()?;
+        layer.get(table)?.get(key).map(|_| ())
+    };
+    overrides.iter().any(|text| says(text).is_some())
+}
+
 /// Text of a built-in pair's configuration file.
 fn of_registry(task: &str) -> Result<&'static str> {
     e2h_env::configuration(task).ok_or_else(|| {

@@ -5,7 +5,9 @@ use crate::{Error, Result};
 use e2h_core::{Episode, ImageStore};
 use e2h_data::lerobot::{Dataset, Writer, features_of};
 use e2h_env::Task;
-use e2h_report::folder::{IDENTITY_FILE, Identity, LAYOUT, SUMS_FILE, compare, read_json, sealed, sha256};
+use e2h_report::folder::{
+    Given, IDENTITY_FILE, Identity, LAYOUT, SUMS_FILE, compare, read_json, sealed, sha256,
+};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::borrow::Borrow;
@@ -184,9 +186,15 @@ impl Directory {
         if found.format != LAYOUT {
             return differs("layout version", LAYOUT.to_string(), found.format.to_string());
         }
-        if found != *identity {
-            let text =
-                |i: &Identity| format!("{} {} {} {} seed {}", i.task, i.preset, i.method, i.policy, i.seed);
+        if !found.same(identity) {
+            let given = |i: &Identity| match &i.given {
+                None => String::new(),
+                Some(g) => format!(", demonstrations given: {} with SHA-256 {}", g.words(), g.sha256),
+            };
+            let text = |i: &Identity| {
+                let run = format!("{} {} {} {} seed {}", i.task, i.preset, i.method, i.policy, i.seed);
+                run + &given(i)
+            };
             return differs("run.json", text(identity), text(&found));
         }
         let config = path.join("config.toml");
@@ -210,6 +218,12 @@ impl Directory {
             }
         }
         Ok(this)
+    }
+
+    /// What the run in a folder was given, if one is there and was given any.
+    pub(crate) fn given(path: &Path) -> Result<Option<Given>> {
+        let found: Option<Identity> = read_json(&path.join(IDENTITY_FILE))?;
+        Ok(found.and_then(|identity| identity.given))
     }
 
     pub(crate) fn path(&self) -> &Path {

@@ -42,6 +42,14 @@ pub enum Error {
     /// The system does not let signals be handled.
     #[error("handling signals: {0}")]
     Signals(std::io::Error),
+    /// A dataset that a run was given cannot stand in for its demonstrator; all that does not fit.
+    #[error("{path}: these demonstrations do not fit the run: {}", problems.join("; "))]
+    Given {
+        /// The dataset.
+        path: PathBuf,
+        /// What was expected, and what was found.
+        problems: Vec<String>,
+    },
     /// A demonstrator could not do its task.
     #[error("{0}")]
     Demonstrations(String),

@@ -3,6 +3,7 @@
 //! Every stage is a function of the configuration, the seed and what earlier stages left, and its result is written whole or
 //! not at all ([`Run::stage`]). Resuming is calling the same stages again: a stage whose result is there reads it.
 
+mod given;
 mod measure;
 mod options;
 mod round;
@@ -19,16 +20,17 @@ use crate::policy_class::{Diffusion, PolicyClass};
 use crate::record::RunResults;
 use crate::tensorboard::Events;
 use crate::{Error, Progress, Result};
-use e2h_core::{Direction, Episode, Kind, Origin, stream};
+use e2h_core::{Direction, Episode, Kind, Origin};
 use e2h_data::{Normaliser, NormaliserConfig};
-use e2h_env::{Env, Task, demonstrate};
+use e2h_env::{Env, Task, demonstrate, demonstration_stream};
 use e2h_nn::Compute;
 use e2h_policy::Provenance;
 use e2h_refine::{kinematic_filter, reverse};
-use e2h_report::folder::{Identity, LAYOUT};
+use e2h_report::folder::{Given, Identity, LAYOUT};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use given::GivenDataset;
 pub use options::{BuildTask, Parts, RunOptions, set_threads};
 pub use round::Accepted;
 pub(crate) use round::Toolbox;
@@ -49,6 +51,8 @@ pub struct Run {
     method: Arc<dyn Method>,
     class: Arc<dyn PolicyClass>,
     env: Env,
+    /// Demonstrations that the run was given; none where it records its own, or has its copy already.
+    given: Option<GivenDataset>,
 }
 
 /// Demonstrations and what is fitted on them.
@@ -84,6 +88,7 @@ impl Run {
         let method = parts.method.clone().unwrap_or(code);
         let own = parts.task.as_ref();
         let text = own.map(|(text, _)| text.as_str());
+        let mut options = options.clone();
         let mut resolved =
             RunConfig::resolve_with(&options.preset, &options.task, text, &values, &options.set)?;
         if let Some(n) = options.threads {
@@ -100,37 +105,46 @@ impl Run {
         }
         resolved.config.know(&*task);
         let config = &resolved.config;
-        method.check(config)?;
         let compute = Compute::open(&options.device, config.device)?;
         let mut env = Env::new(task.clone(), &config.env)?;
         if !config.policy.cameras.is_empty() {
             env.select_cameras(&config.policy.cameras)?;
         }
         let class = method.policies().or_else(|| parts.policy.clone()).unwrap_or_else(|| Arc::new(Diffusion));
-        let identity = Identity {
+        let mut identity = Identity {
             format: LAYOUT,
             task: options.task.clone(),
             preset: options.preset.clone(),
             seed: options.seed,
             method: parts.method.as_ref().map_or(&*options.method, |m| m.name()).to_owned(),
             policy: class.name().to_owned(),
+            given: None,
         };
         let path = options.out.clone().unwrap_or_else(|| default_folder(&identity));
+        let asked = crate::config::sets(&options.set, "loop", "demonstrations")
+            .then_some(config.closed_loop.demonstrations);
+        let given = options
+            .demonstrations
+            .as_ref()
+            .map(|root| GivenDataset::open(root, config, &*task, env.cameras(), asked))
+            .transpose()?;
+        identity.given = match &given {
+            Some(given) => Some(given.given.clone()),
+            // A run that has its copy goes on without the original.
+            None if options.resume => Directory::given(&path)?,
+            None => None,
+        };
+        if let (Some(given), None) = (&identity.given, asked) {
+            options.set.push(format!("loop.demonstrations={}", given.episodes));
+            resolved = RunConfig::resolve_with(&options.preset, &options.task, text, &values, &options.set)?;
+            resolved.config.know(&*task);
+        }
+        method.check(&resolved.config)?;
         let dir = Directory::open(&path, options.resume, &identity, &resolved, &*task)?;
         let progress = Progress::new(options.quiet).stopping(options.stop.clone());
-        let run = Self {
-            options: options.clone(),
-            resolved,
-            dir,
-            progress,
-            compute,
-            task,
-            method,
-            class,
-            identity,
-            env,
-        };
-        if let Some(other) = &options.initial_from {
+        let run =
+            Self { options, resolved, dir, progress, compute, task, method, class, identity, env, given };
+        if let Some(other) = &run.options.initial_from {
             run.take_over(other)?;
         }
         Ok(run)
@@ -204,7 +218,7 @@ impl Run {
         self.method.learn(self)
     }
 
-    /// Records the easy demonstrations and reverses them into `D_h^(0)`.
+    /// Records the easy demonstrations, or copies those that the run was given, and reverses them into `D_h^(0)`.
     ///
     /// # Errors
     /// When the demonstrator fails more often than it succeeds, or the folder cannot be written.
@@ -242,12 +256,15 @@ impl Run {
         }
     }
 
-    /// Successful scripted demonstrations, recorded once.
+    /// Successful demonstrations, scripted and recorded once; of the easy task those that the run was given, if it was.
     fn demonstrate(&self, direction: Direction) -> Result<Vec<Episode>> {
         let c = self.config();
-        let (place, purpose) = match direction {
-            Direction::Easy => ("demonstrations", "demonstrate"),
-            Direction::Hard => (HARD_DEMONSTRATIONS, "demonstrate/hard"),
+        if let (Direction::Easy, Some(given)) = (direction, &self.identity.given) {
+            return self.stage("demonstrations", || self.copy_given(given));
+        }
+        let place = match direction {
+            Direction::Easy => "demonstrations",
+            Direction::Hard => HARD_DEMONSTRATIONS,
         };
         self.stage(place, || {
             let wanted = c.closed_loop.demonstrations;
@@ -259,7 +276,7 @@ impl Run {
             while episodes.len() < wanted {
                 self.progress.check()?;
                 let origin = Origin::demonstration(&self.options.task, direction, index, self.options.seed);
-                let mut rng = stream(self.options.seed, purpose, 0, u64::from(index));
+                let mut rng = demonstration_stream(self.options.seed, direction, index);
                 let episode = match demonstrate(&mut env, direction, &c.task.demonstrator, origin, &mut rng) {
                     Err(e2h_env::Error::Diverged(_)) => None,
                     recorded => Some(recorded?).filter(|e| e.outcome.is_success()),
@@ -282,6 +299,19 @@ impl Run {
             bar.finish(&format!("{wanted} recorded, {failed} failed"));
             Ok(episodes)
         })
+    }
+
+    fn copy_given(&self, given: &Given) -> Result<Vec<Episode>> {
+        let Some(dataset) = &self.given else {
+            let problem = "the run was stopped before it had copied them: give --demonstrations again";
+            return Err(Error::Given {
+                path: PathBuf::from(&given.from),
+                problems: vec![problem.to_owned()],
+            });
+        };
+        let episodes = dataset.read(self.dir.images())?;
+        self.progress.say(&format!("easy demonstrations: {}", given.words()));
+        Ok(episodes)
     }
 
     /// An event file of one stage, which starts or goes on at `step`; none when nobody asked for them. Each stage has a folder:

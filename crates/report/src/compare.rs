@@ -144,6 +144,10 @@ impl Comparison {
                 let [x, y] = [x.demonstrations, y.demonstrations].map(|n| n.to_string());
                 return differ(a, b, "demonstrations", &x, &y);
             }
+            let given = [x, y].map(|r| r.given.as_ref().map_or("scripted", |g| &*g.sha256));
+            if x.task == y.task && given[0] != given[1] {
+                return differ(a, b, "demonstrations", given[0], given[1]);
+            }
         }
         if let Some(w) = runs.windows(2).find(|w| key(&w[0]) == key(&w[1])) {
             return Err(Error::Options(format!("compare: two runs of {}", name(&w[0]))));
@@ -418,6 +422,17 @@ mod tests {
         assert!(refused(|r| r[4].results.overrides = vec!["a=1".to_owned()]).contains("found a=1"));
         assert!(refused(|r| r[4].results.variant = "square".to_owned()).contains("variant"));
         assert!(refused(|r| r[4].results.demonstrations = 9).contains("expected 5, found 9"));
+        let message = refused(|r| {
+            r[4].results.given = Some(crate::folder::Given {
+                from: "hand".to_owned(),
+                sha256: "c0ffee".to_owned(),
+                episodes: 5,
+                of: 6,
+                resized: false,
+                seconds: None,
+            });
+        });
+        assert!(message.contains("expected scripted, found c0ffee"), "{message}");
         assert!(refused(|r| r[5].results.seed = 1).contains("two runs of"));
         assert!(refused(|r| r[6].last.outcomes.truncate(39)).contains("expected 40, found 39"));
         assert!(refused(Vec::clear).contains("at least one run"));

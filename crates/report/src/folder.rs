@@ -35,6 +35,60 @@ pub struct Identity {
     /// Class of its policies; none in runs of version 0.1, which were all `diffusion`.
     #[serde(default = "diffusion")]
     pub policy: String,
+    /// Easy demonstrations that it was given; none where its scripted demonstrator recorded them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub given: Option<Given>,
+}
+
+impl Identity {
+    /// Whether both are one run: the same of everything, but for the place and the pace of demonstrations that were given.
+    #[must_use]
+    pub fn same(&self, other: &Self) -> bool {
+        let mut alike = other.clone();
+        if let (Some(a), Some(b)) = (&mut alike.given, &self.given)
+            && a.same(b)
+        {
+            *a = b.clone();
+        }
+        alike == *self
+    }
+}
+
+/// A dataset of easy demonstrations that a run was given in place of scripted ones.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Given {
+    /// The folder, as it was named.
+    pub from: String,
+    /// SHA-256 of its files and their names.
+    pub sha256: String,
+    /// Successful episodes that the run took, the first ones.
+    pub episodes: usize,
+    /// Episodes that there were.
+    pub of: usize,
+    /// Whether its images were larger than the run's, and were made smaller.
+    #[serde(default)]
+    pub resized: bool,
+    /// Seconds that a person took for the episodes taken; none where that is not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seconds: Option<f64>,
+}
+
+impl Given {
+    /// Whether both are the same episodes of the same dataset.
+    #[must_use]
+    pub fn same(&self, other: &Self) -> bool {
+        (&self.sha256, self.episodes) == (&other.sha256, other.episodes)
+    }
+
+    /// In words.
+    #[must_use]
+    pub fn words(&self) -> String {
+        let smaller = if self.resized { ", images made smaller" } else { "" };
+        let pace = self.seconds.map_or(String::new(), |s| {
+            format!(", {:.1} s each by the clock", s / self.episodes.max(1) as f64)
+        });
+        format!("{} of {} episodes of {}{smaller}{pace}", self.episodes, self.of, self.from)
+    }
 }
 
 fn diffusion() -> String {
@@ -171,6 +225,7 @@ mod tests {
             seed: 7,
             method: auto_e2h(),
             policy: diffusion(),
+            given: None,
         };
         let text = format!("{}\n", sealed(&serde_json::to_string_pretty(&identity).unwrap()));
         std::fs::write(&path, &text).unwrap();

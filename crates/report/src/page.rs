@@ -240,6 +240,9 @@ fn provenance(results: &RunResults) -> String {
         results.demonstration_steps,
         results.demonstration_steps / CONTROL_HZ
     );
+    let from = results.given.as_ref().map_or("the scripted demonstrator".to_owned(), |given| {
+        format!("{} (SHA-256 {})", given.words(), given.sha256)
+    });
     let rows = [
         ("library", format!("auto-e2h {}", results.version)),
         ("machine", results.machine.clone()),
@@ -247,6 +250,7 @@ fn provenance(results: &RunResults) -> String {
         ("preset", results.preset.clone()),
         ("seed", results.seed.to_string()),
         ("easy demonstration", demonstration),
+        ("demonstrations from", from),
     ];
     let rows: String =
         rows.iter().map(|(name, value)| format!("<dt>{name}</dt><dd>{}</dd>\n", escape(value))).collect();

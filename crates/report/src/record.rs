@@ -251,6 +251,9 @@ pub struct RunResults {
     /// Easy demonstrations that the run began with; 0 in results of version 0.1.
     #[serde(default)]
     pub demonstrations: usize,
+    /// Where they came from, if the run was given them; none where its scripted demonstrator recorded them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub given: Option<crate::folder::Given>,
     /// Whether easy rollouts explored.
     #[serde(default)]
     pub explored: bool,
@@ -261,7 +264,7 @@ pub struct RunResults {
     pub machine: String,
     /// The success curve.
     pub iterations: Vec<IterationRecord>,
-    /// Mean control steps of a scripted demonstration, easy direction (the paper's cost table).
+    /// Mean control steps of a demonstration, easy direction (the paper's cost table).
     pub demonstration_steps: f64,
     /// The same of the hard direction, in runs that begin with such demonstrations; none in others.
     #[serde(default, skip_serializing_if = "Option::is_none")]

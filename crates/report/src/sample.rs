@@ -70,6 +70,7 @@ pub(crate) fn results(seed: u64, iterations: u32) -> RunResults {
         seed,
         version: "0.1.0".to_owned(),
         demonstrations: 10,
+        given: None,
         explored: true,
         overrides: vec![],
         machine: "2 threads, some processor".to_owned(),

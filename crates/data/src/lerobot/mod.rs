@@ -17,6 +17,7 @@ mod episode;
 mod episodes;
 mod feature;
 mod info;
+mod layout;
 mod limits;
 mod mp4;
 mod packing;
@@ -43,6 +44,7 @@ pub use episode::{
 pub use episodes::{EpisodeSpan, VideoSpan};
 pub use feature::{DEFAULT_FEATURES, Dtype, Feature, Features, Skipped, VERSION};
 pub use info::Info;
+pub use layout::misfits;
 pub use picture::{decode_image as decode_png, encode as encode_png};
 pub use repair::{REMOVED, repair};
 pub use robot::{ColumnSlice, RobotColumns, Rotation};

@@ -104,6 +104,9 @@ pub fn model_card(
     card += &format!("Preset {}, seed {}, after {} updates.\n", plain(&p.preset), p.seed, p.iteration);
     let Some(results) = results.filter(|r| !r.iterations.is_empty()) else { return card };
     card += &format!("On {}.\n\n", plain(&results.machine));
+    if let Some(given) = &results.given {
+        card += &format!("Demonstrations that were given to it: {}.\n\n", plain(&given.words()));
+    }
     card += "## Success by iteration\n\n![success by iteration](curve.svg)\n\n";
     card += "| iteration | successes | Wilson 95 % | minutes |\n|---|---|---|---|\n";
     for i in &results.iterations {

@@ -127,6 +127,7 @@ impl Run {
             seed: self.options.seed,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             demonstrations: c.closed_loop.demonstrations,
+            given: self.identity.given.clone(),
             explored: c.closed_loop.explore.enabled,
             overrides: self.options.set.clone(),
             machine: machine(self.compute.name()),

@@ -25,6 +25,9 @@ pub struct RunOptions {
     /// The run directory; by default `runs/<task>-<preset>-<seed>`, with the method and the class of policies before the seed where
     /// they are not the usual ones.
     pub out: Option<PathBuf>,
+    /// A LeRobot dataset of the easy task, in the layout that runs record, in place of the scripted demonstrator. All of its successful
+    /// episodes are used, or the first `loop.demonstrations` where [`RunOptions::set`] says how many.
+    pub demonstrations: Option<PathBuf>,
     /// Go on with a run directory that exists.
     pub resume: bool,
     /// Another run's directory, whose finished stages before the loop are copied where they are what this run would make, byte for byte
@@ -54,6 +57,7 @@ impl RunOptions {
             seed: 0,
             set: vec![],
             out: None,
+            demonstrations: None,
             resume: false,
             initial_from: None,
             device: "cpu".to_owned(),

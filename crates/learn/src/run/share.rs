@@ -15,7 +15,12 @@ impl Run {
     pub(super) fn take_over(&self, other: &Path) -> Result<()> {
         let there = RunFolder::open(other)?;
         let (a, b) = (there.identity(), &self.identity);
-        let identity = (&a.task, &a.preset, a.seed, &a.policy) == (&b.task, &b.preset, b.seed, &b.policy);
+        let given = match (&a.given, &b.given) {
+            (Some(a), Some(b)) => a.same(b),
+            (a, b) => a.is_none() && b.is_none(),
+        };
+        let identity =
+            given && (&a.task, &a.preset, a.seed, &a.policy) == (&b.task, &b.preset, b.seed, &b.policy);
         let path = other.join("config.toml");
         let text = e2h_data::read_text(&path).map_err(crate::directory::io("reading", &path))?;
         let mut theirs = RunConfig::from_text(&a.preset, &text)

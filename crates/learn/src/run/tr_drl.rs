@@ -8,7 +8,7 @@ use crate::rollout;
 use crate::tr_drl::{Agents, Demonstrated, Kind, Report, Trip, play, replay, side};
 use crate::{Error, Result};
 use e2h_core::{Direction, Episode, State, align_hemisphere, stream};
-use e2h_env::Env;
+use e2h_env::{Env, demonstration_stream};
 use e2h_nn::Weights;
 use e2h_policy::sac::{Adapter, StatePolicy};
 use rand::Rng as _;
@@ -141,13 +141,12 @@ impl Run {
     ) -> Result<()> {
         let c = &self.config().tr_drl;
         let seed = self.options.seed;
-        for (direction, purpose, all) in
-            [(Direction::Easy, "demonstrate", easy), (Direction::Hard, "demonstrate/hard", hard)]
-        {
+        for (direction, all) in [(Direction::Easy, easy), (Direction::Hard, hard)] {
             let mut kept = 0;
             for episode in all {
                 self.progress.check()?;
-                let mut rng = stream(seed, purpose, 0, u64::from(episode.origin.episode));
+                // Demonstrations that the run was given have a seed of their own.
+                let mut rng = demonstration_stream(episode.origin.seed, direction, episode.origin.episode);
                 env.reset(direction, &mut rng)?;
                 let trip = replay(env, agents.adapter(direction), direction, c.reward, &episode.action)?;
                 if trip.success.is_some() {

@@ -170,6 +170,7 @@ impl RunSource {
             seed: self.dir.identity().seed,
             version: String::new(),
             demonstrations: self.config.as_ref().map_or(0, |c| c.closed_loop.demonstrations),
+            given: self.dir.identity().given.clone(),
             explored: self.config.as_ref().is_ok_and(|c| c.closed_loop.explore.enabled),
             overrides: vec![],
             machine: String::new(),

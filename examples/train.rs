@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! cargo run --release --example train -- --dataset refined/plug_in --out runs/plug_in
-//! cargo run --release --example train -- --dataset a --dataset b:0.5 --preset smoke --out runs/both
+//! cargo run --release --example train -- --dataset a --dataset b:0.5 --set data.resize=[72,96] --out runs/both
 //! ```
 
 use anyhow::Context as _;
@@ -27,7 +27,7 @@ enum Preset {
 #[derive(Parser)]
 #[command(
     version,
-    after_help = "Examples:\n  cargo run --release --example train -- --dataset refined/plug_in --out runs/plug_in\n  cargo run --release --example train -- --dataset a --dataset b:0.5 --set data.resize=[72,96] --set data.crop=[64,84] --out runs/both"
+    after_help = "Examples:\n  cargo run --release --example train -- --dataset refined/plug_in --out runs/plug_in\n  cargo run --release --example train -- --dataset a --dataset b:0.5 --set data.resize=[72,96] --out runs/both"
 )]
 struct Arguments {
     /// Folder of a dataset, and its share of every batch relative to the others' (may be repeated).

@@ -57,7 +57,7 @@ fn words_that_cannot_be_written_stop_nothing() {
 
 /// Every program that prints, with little to do. NEW is a folder of its own; RUN, SET and OURS are a finished run, recordings and a
 /// checkpoint that LeRobot can have.
-const PROGRAMS: [(&str, &str); 16] = [
+const PROGRAMS: [(&str, &str); 18] = [
     ("nut_assembly", "--preset smoke --quiet --resume --out RUN SMALL"),
     (
         "compare",
@@ -74,12 +74,18 @@ const PROGRAMS: [(&str, &str); 16] = [
     ("interop", "write NEW/set"),
     ("mixed_network", ""),
     ("peer", "--batch 1 --repeats 1 --threads 1"),
+    ("real_robot", "record --episodes 1 --out NEW/recordings"),
     ("refine", "--dataset SET --out NEW/refined --pose observation.state[0:7] --rotation wxyz --task back"),
     ("speed", "1 nothing"),
+    (
+        "train",
+        "--dataset SET --preset smoke --set data.validation=0.3 --set data.resize=[40,40] --set train.steps=1 --out NEW/trained",
+    ),
     ("view", "RUN --out NEW/page.html --tensorboard NEW/events"),
 ];
-/// The other benchmarks are run by what runs `nut_assembly`; `publish` needs a hub; `lerobot_actions` prints nothing.
-const OTHERS: [&str; 13] = [
+/// The other benchmarks are run by what runs `nut_assembly`; `publish` needs a hub; `lerobot_actions` prints nothing;
+/// `serve` waits for clients, and `teleop` for a person.
+const OTHERS: [&str; 15] = [
     "brush",
     "cube_pick_place",
     "cube_stack",
@@ -92,6 +98,8 @@ const OTHERS: [&str; 13] = [
     "peg_insertion",
     "publish",
     "rod_insertion",
+    "serve",
+    "teleop",
     "test_tube",
 ];
 

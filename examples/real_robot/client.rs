@@ -91,7 +91,7 @@ fn one(
         }
         let Some([x, y, z, jaw]) = chunk.pop_front() else { break };
         if let Some(film) = film.as_mut().filter(|_| steps % 3 == 0) {
-            film.push(robot.image());
+            film.push(enlarged(&robot.image()));
         }
         for _ in 0..ticks {
             robot.step([x, y, z], jaw);
@@ -105,6 +105,14 @@ fn one(
         steps += 1;
     }
     Ok(false)
+}
+
+/// The picture three times as large, for people.
+fn enlarged(image: &Image) -> Image {
+    let (height, width) = (3 * image.height, 3 * image.width);
+    let pixel = |i: usize| &image.data[(i / width / 3 * image.width + i % width / 3) * 3..][..3];
+    let data = (0..height * width).flat_map(|i| pixel(i).iter().copied()).collect();
+    Image { height, width, data }
 }
 
 /// The next goals, in the robot's own units: x, y, z and jaws, mm.

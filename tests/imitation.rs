@@ -139,13 +139,15 @@ fn train_lists_all_that_does_not_fit_before_any_work() {
     for part in ["rows a second: expected 30, found 20", "`action`", "expected at least 2 episodes"] {
         assert!(all.contains(part), "{all}");
     }
-    let sizes = refused(&[a.clone()], &["--set=data.resize=[]"]);
+    let sizes = refused(std::slice::from_ref(&a), &["--set=data.resize=[]"]);
     assert!(sizes.contains("images of one size") && sizes.contains("data.resize"), "{sizes}");
-    let small = refused(&[a.clone()], &["--set=data.crop=[30,30]"]);
+    let small = refused(std::slice::from_ref(&a), &["--set=data.crop=[30,30]"]);
     assert!(small.contains("map of 1 x 1"), "{small}");
-    let unknown = refused(&[a.clone()], &["--set=data.cameras=[\"wrist\"]", "--set=policy.keypoints=8"]);
+    let unknown =
+        refused(std::slice::from_ref(&a), &["--set=data.cameras=[\"wrist\"]", "--set=policy.keypoints=8"]);
     assert!(unknown.contains("camera `wrist`") && unknown.contains("observation.images.front"), "{unknown}");
-    let network = refused(&[a.clone()], &["--set=policy.horizon=15", "--set=policy.down_dims=[30]"]);
+    let network =
+        refused(std::slice::from_ref(&a), &["--set=policy.horizon=15", "--set=policy.down_dims=[30]"]);
     assert!(network.contains("horizon") && network.contains("down_dims"), "{network}");
     assert!(refused(&[format!("{a}:0")], &[]).contains("share above 0"));
     assert!(refused(&["nowhere".to_owned()], &[]).contains("nowhere"));

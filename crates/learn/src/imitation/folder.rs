@@ -47,8 +47,8 @@ impl Identity {
             .or_else(|| same("seed", self.seed.to_string(), found.seed.to_string()))
             .or_else(|| same("datasets", names(self), names(found)))
             .or_else(|| {
-                let pairs = self.datasets.iter().zip(&found.datasets);
-                pairs.map(|(a, b)| (a, b)).find_map(|(a, b)| {
+                let mut pairs = self.datasets.iter().zip(&found.datasets);
+                pairs.find_map(|(a, b)| {
                     let text = |d: &DatasetRecord| format!("{} episodes, SHA-256 {}", d.episodes, d.sha256);
                     same(&format!("dataset {}, which has changed", a.root), text(a), text(b))
                 })

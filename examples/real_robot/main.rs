@@ -57,8 +57,9 @@ enum What {
 }
 
 fn main() -> Result<(), auto_e2h::core::Failure> {
-    Ok(match Arguments::parse().what {
+    match Arguments::parse().what {
         What::Record { episodes, seed, out } => record::record(&out, episodes, seed)?,
         What::Run { server, trials, seed, video } => client::run(&server, trials, seed, video.as_deref())?,
-    })
+    }
+    Ok(())
 }

@@ -84,17 +84,17 @@ impl Robot {
         }
     }
 
-    fn from_socket(&self) -> [f64; 2] {
+    fn off_socket(&self) -> [f64; 2] {
         [self.plug[0] - SOCKET[0], self.plug[1] - SOCKET[1]]
     }
 
     fn in_hole(&self) -> bool {
-        self.from_socket().iter().all(|d| d.abs() <= PLAY)
+        self.off_socket().iter().all(|d| d.abs() <= PLAY)
     }
 
     /// What the plug would stand on.
     fn floor(&self) -> f64 {
-        let on_block = self.from_socket().iter().all(|d| d.abs() < BLOCK.0 + PLUG / 2.0);
+        let on_block = self.off_socket().iter().all(|d| d.abs() < BLOCK.0 + PLUG / 2.0);
         if on_block && !self.in_hole() { BLOCK.1 } else { 0.0 }
     }
 
@@ -105,7 +105,7 @@ impl Robot {
 
     /// The plug lies on the table, away from the socket, and the hand has let go of it and gone up.
     pub(crate) fn unplugged(&self) -> bool {
-        let [x, y] = self.from_socket();
+        let [x, y] = self.off_socket();
         x.hypot(y) > 70.0 && self.plug[2] < 1.0 && self.free()
     }
 

@@ -1,8 +1,8 @@
 //! The critic: how far along is this frame?
 
 use crate::batch::{BatchBuilder, Rows};
+use crate::divergence::{Skipped, sound};
 use crate::model::ConditionEncoder;
-use crate::train::{Skipped, sound};
 use crate::train_config::without_zero_clip;
 use crate::{CriticConfig, EncoderNorm, Error, PolicyConfig, Result};
 use candle_core::Tensor;

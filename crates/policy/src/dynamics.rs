@@ -2,8 +2,8 @@
 //! and which action would have made it?
 
 use crate::batch::{BatchBuilder, Rows};
+use crate::divergence::{Skipped, sound};
 use crate::model::ConditionEncoder;
-use crate::train::{Skipped, sound};
 use crate::{EncoderNorm, Error, PolicyConfig, Result};
 use candle_core::Tensor;
 use e2h_core::{ACTION_DIM, Action, Episode, stream};

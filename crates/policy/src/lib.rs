@@ -28,6 +28,7 @@ mod config;
 mod critic;
 mod critic_file;
 mod ddim;
+mod divergence;
 mod dynamics;
 mod error;
 mod examples;

@@ -119,7 +119,7 @@ fn train_learns_from_datasets_of_an_unknown_robot_and_resumes_to_the_same_bytes(
     let other = refused(train(&datasets, &whole).args(["--resume", "--set", "train.steps=30"]));
     assert!(other.contains("steps = 30"), "{other}");
     assert_eq!(files(&whole), a);
-    std::fs::write(dir.path().join("b/note.txt"), "more").unwrap();
+    std::fs::write(dir.path().join("b/meta/note.txt"), "more").unwrap();
     let changed = refused(train(&datasets, &whole).arg("--resume"));
     assert!(changed.contains("which has changed"), "{changed}");
 }

@@ -17,6 +17,7 @@
 
 mod collect;
 pub mod config;
+mod digest;
 mod directory;
 mod error;
 mod evaluate;

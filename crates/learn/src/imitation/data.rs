@@ -9,7 +9,6 @@ use e2h_policy::ImageScaling;
 use e2h_policy::lerobot::IMAGENET;
 use rand::seq::SliceRandom as _;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest as _, Sha256};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
@@ -114,7 +113,7 @@ impl Opened {
             return Err(Error::Config(problems.join("; ")));
         }
         for (dataset, record) in &mut datasets {
-            record.sha256 = digest(dataset.root())?;
+            record.sha256 = crate::digest::of_dataset(dataset.root())?;
         }
         let layout = Arc::new(layouts.swap_remove(0));
         Ok(Self { datasets, layout })
@@ -173,30 +172,6 @@ fn held_out(episodes: usize, share: f32, seed: u64, dataset: usize) -> Vec<usize
     all.truncate(count);
     all.sort_unstable();
     all
-}
-
-/// SHA-256 of all files below `root`, by their names; of videos, which are many times the rest, of their lengths alone.
-fn digest(root: &Path) -> Result<String> {
-    let mut files = vec![];
-    let mut folders = vec![root.to_owned()];
-    while let Some(folder) = folders.pop() {
-        let io = |source| Error::Io { doing: "reading", path: folder.clone(), source };
-        for entry in std::fs::read_dir(&folder).map_err(io)? {
-            let path = entry.map_err(io)?.path();
-            if path.is_dir() { folders.push(path) } else { files.push(path) }
-        }
-    }
-    files.sort();
-    let mut hasher = Sha256::new();
-    for path in files {
-        let io = |source| Error::Io { doing: "reading", path: path.clone(), source };
-        hasher.update(path.strip_prefix(root).unwrap_or(&path).to_string_lossy().as_bytes());
-        hasher.update(std::fs::metadata(&path).map_err(io)?.len().to_le_bytes());
-        if path.extension().is_none_or(|e| e != "mp4") {
-            std::io::copy(&mut std::fs::File::open(&path).map_err(io)?, &mut hasher).map_err(io)?;
-        }
-    }
-    Ok(hasher.finalize().iter().map(|b| format!("{b:02x}")).collect())
 }
 
 /// Images of each camera that the statistics are of.

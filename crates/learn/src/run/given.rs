@@ -6,12 +6,10 @@ use e2h_core::{CONTROL_HZ, Direction, Episode, Image, ImageStore, Kind};
 use e2h_data::HandRecording;
 use e2h_data::lerobot::{Dataset, misfits};
 use e2h_env::Task;
-use e2h_report::folder::{Given, sha256};
+use e2h_report::folder::Given;
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-/// Folders whose files are the dataset; what lies beside them may change.
-const FOLDERS: [&str; 3] = ["meta", "data", "videos"];
 /// Problems of single episodes that are listed; more are counted.
 const MOST_LISTED: usize = 12;
 /// How far the length of a quaternion may be from 1.
@@ -74,7 +72,7 @@ impl GivenDataset {
         });
         let given = Given {
             from: e2h_core::one_line(&root.display().to_string()),
-            sha256: digest(root)?,
+            sha256: crate::digest::of_dataset(root)?,
             episodes: chosen.len(),
             of: dataset.len(),
             resized: larger,
@@ -95,7 +93,7 @@ impl GivenDataset {
             episode.store_images(images)?;
             episodes.push(episode);
         }
-        let found = digest(&self.root)?;
+        let found = crate::digest::of_dataset(&self.root)?;
         if found != self.given.sha256 {
             let (expected, quantity) = (self.given.sha256.clone(), "SHA-256 of the dataset".to_owned());
             return Err(Error::Foreign { path: self.root.clone(), quantity, expected, found });
@@ -208,34 +206,4 @@ fn faults(episode: &Episode, task: &str) -> Vec<String> {
         faults.push("action: expected gripper commands of 0 to 1, found others".to_owned());
     }
     faults
-}
-
-/// SHA-256 of the names and the contents of all files of a dataset.
-fn digest(root: &Path) -> Result<String> {
-    let (mut folders, mut files) = (FOLDERS.map(PathBuf::from).to_vec(), vec![]);
-    while let Some(folder) = folders.pop() {
-        let place = root.join(&folder);
-        if !place.is_dir() {
-            continue;
-        }
-        for entry in std::fs::read_dir(&place).map_err(crate::directory::io("reading", &place))?.flatten() {
-            let name = folder.join(entry.file_name());
-            // On its way to its place, and not yet part of anything.
-            let unfinished = entry.file_name().to_string_lossy().starts_with(".new-");
-            if entry.path().is_dir() {
-                folders.push(name);
-            } else if !unfinished {
-                files.push(name);
-            }
-        }
-    }
-    files.sort();
-    let mut list = String::new();
-    for name in files {
-        let path = root.join(&name);
-        let bytes = e2h_data::read_file(&path, e2h_data::MOST_WEIGHTS)
-            .map_err(crate::directory::io("reading", &path))?;
-        list += &format!("{} {}\n", sha256(&bytes), name.display());
-    }
-    Ok(sha256(list.as_bytes()))
 }

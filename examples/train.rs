@@ -9,19 +9,9 @@ use anyhow::Context as _;
 use auto_e2h::core::{Failure, mention, say};
 use auto_e2h::learn::imitation::{DatasetShare, Imitated, ImitationOptions, imitate};
 use auto_e2h::learn::{Error, Stop};
-use clap::{Parser, ValueEnum};
+use clap::Parser;
 use std::path::PathBuf;
 use std::process::ExitCode;
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Preset {
-    /// Seconds; shows that everything runs.
-    Smoke,
-    /// Two CPU cores; the default.
-    Laptop,
-    /// LeRobot's sizes and steps.
-    Paper,
-}
 
 /// Trains a policy on LeRobotDatasets v3.0: state and action of any width, any cameras, any rate. The policy opens in LeRobot too.
 #[derive(Parser)]
@@ -33,9 +23,9 @@ struct Arguments {
     /// Folder of a dataset, and its share of every batch relative to the others' (may be repeated).
     #[arg(long, value_name = "DIR[:SHARE]", required = true)]
     dataset: Vec<String>,
-    /// Sizes and step counts to run with: a file of configs/train.
-    #[arg(long, value_enum, default_value = "laptop")]
-    preset: Preset,
+    /// Sizes and step counts to run with: a file of configs/train. smoke shows in seconds that everything runs, paper is LeRobot's.
+    #[arg(long, value_parser = ["smoke", "laptop", "paper"], default_value = "laptop")]
+    preset: String,
     /// Folder of the training.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -80,14 +70,9 @@ fn main() -> ExitCode {
 
 fn program(a: Arguments) -> anyhow::Result<Imitated> {
     let datasets = a.dataset.iter().map(|d| d.parse::<DatasetShare>()).collect::<Result<_, _>>()?;
-    let preset = match a.preset {
-        Preset::Smoke => "smoke",
-        Preset::Laptop => "laptop",
-        Preset::Paper => "paper",
-    };
     let options = ImitationOptions {
         datasets,
-        preset: preset.to_owned(),
+        preset: a.preset,
         set: a.set,
         seed: a.seed,
         out: a.out,

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 pub(crate) use layers::suggestion;
-use layers::{find, inner, layer, merge, parse};
+use layers::{find, inner, layer, merge, parse, typed};
 
 const PRESETS: [(&str, &str); 3] = [
     ("smoke", include_str!("../../../configs/presets/smoke.toml")),
@@ -325,10 +325,7 @@ impl RunConfig {
     }
 
     fn from_table(preset: &str, table: Table) -> Result<Resolved> {
-        let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
-        let config: Self = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
-            Error::Config(e2h_core::one_line(&e.to_string().trim().replace('\n', " ")))
-        })?;
+        let (config, text): (Self, String) = typed(table)?;
         config.validate()?;
         Ok(Resolved { preset: preset.to_owned(), config, text })
     }

@@ -2,6 +2,7 @@
 
 use crate::{Error, Result};
 use e2h_core::nearest;
+use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
 /// The text of this name.
@@ -22,6 +23,15 @@ pub(crate) fn suggestion(name: &str, prefix: &str, known: &[&str]) -> String {
 
 pub(crate) fn parse(name: &str, text: &str) -> Result<Table> {
     text.parse::<Table>().map_err(|e| Error::Config(format!("{name}: {}", e.message())))
+}
+
+/// A whole table as what it configures, and as text.
+pub(crate) fn typed<T: DeserializeOwned>(table: Table) -> Result<(T, String)> {
+    let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
+    let config = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
+        Error::Config(e2h_core::one_line(&e.to_string().trim().replace('\n', " ")))
+    })?;
+    Ok((config, text))
 }
 
 /// Keys of earlier versions, and what says it now.

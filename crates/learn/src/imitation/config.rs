@@ -1,11 +1,11 @@
 //! How a policy is trained on recordings: preset < `--set key=value`, checked before any work.
 
-use crate::config::layers::{find, layer, merge, parse};
+use crate::config::layers::{find, layer, merge, parse, typed};
 use crate::{Error, Result};
 use e2h_policy::lerobot::{Features, network_obstacles};
 use e2h_policy::{EncoderNorm, PolicyConfig, Prediction, SamplerKind, TrainConfig};
 use serde::{Deserialize, Serialize};
-use toml::{Table, Value};
+use toml::Table;
 
 const PRESETS: [(&str, &str); 3] = [
     ("smoke", include_str!("../../../../configs/train/smoke.toml")),
@@ -168,10 +168,7 @@ impl ImitationConfig {
     }
 
     fn from_table(table: Table) -> Result<(Self, String)> {
-        let text = toml::to_string(&table).map_err(|e| Error::Config(e.to_string()))?;
-        let config: Self = Value::Table(table).try_into().map_err(|e: toml::de::Error| {
-            Error::Config(e2h_core::one_line(&e.to_string().trim().replace('\n', " ")))
-        })?;
+        let (config, text): (Self, String) = typed(table)?;
         let problems = config.problems();
         if problems.is_empty() { Ok((config, text)) } else { Err(Error::Config(problems.join("; "))) }
     }
@@ -242,6 +239,7 @@ impl ImitationConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use toml::Value;
 
     fn keys(table: &Table, path: &str, out: &mut Vec<String>) {
         for (k, v) in table {

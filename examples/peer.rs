@@ -44,7 +44,7 @@ struct Arguments {
     /// Factors of products in bf16.
     #[arg(long)]
     bf16: bool,
-    /// Compute with Candle's operations, as on a GPU, whatever the device.
+    /// Compute with Candle's operations instead of our kernels, whatever the device.
     #[arg(long)]
     candle: bool,
     /// Also time Candle's product of two 2048 x 2048 matrices, and say what share of its rate a training step reaches.

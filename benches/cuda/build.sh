@@ -5,7 +5,6 @@
 #   benches/cuda/build.sh [--check]        --check: only `cargo check`, links nothing
 #
 #   CAPABILITY=90   compute capability times ten: 90 for H100 and H200 alone, 80 for these and all from A100 on
-#   FEATURES=cuda   or cuda,cudnn,nccl
 #   JOBS=2
 #
 # Takes nvcc 13.0 as Python wheels (105 MB). A newer one writes PTX that drivers of the 580 series refuse.
@@ -13,7 +12,7 @@ set -euo pipefail
 cd "$(dirname "$0")/../.."
 root=$PWD check=0
 [ "${1:-}" != --check ] || check=1
-capability=${CAPABILITY:-90} features=${FEATURES:-cuda} jobs=${JOBS:-2}
+capability=${CAPABILITY:-90} jobs=${JOBS:-2}
 triple=x86_64-unknown-linux-gnu
 here=$root/target/cuda
 mkdir -p "$here/link" "$here/bin"
@@ -28,7 +27,7 @@ fi
 toolkit=$(echo "$here"/venv/lib/python3*/site-packages/nvidia/cu13)
 
 # The linker is asked for these by name, but takes nothing from them: every function is looked up when the program runs.
-for name in cuda nvrtc curand cublas cublasLt cudnn nccl; do
+for name in cuda nvrtc curand cublas cublasLt; do
     [ -e "$here/link/lib$name.so" ] || gcc -shared -x c /dev/null -o "$here/link/lib$name.so"
 done
 ln -sfn "$toolkit/lib/libcudart_static.a" "$here/link/libcudart.a"
@@ -64,10 +63,8 @@ export CUDARC_CUDA_VERSION=13000 CUDAFORGE_THREADS=$jobs CARGO_TARGET_DIR=$here/
 export RUSTFLAGS="${RUSTFLAGS:-} --cfg feature=\"dynamic-loading\""
 unset CUDA_PATH CUDA_ROOT CUDA_TOOLKIT_ROOT_DIR CUDNN_LIB
 common=(--release --locked --target "$triple" -j "$jobs")
-members=()
-for feature in ${features//,/ }; do members+=("auto-e2h/$feature" "e2h-nn/$feature" "e2h-policy/$feature"); done
 # The same packages for both, so that nothing below them is compiled twice.
-common+=(-p auto-e2h -p e2h-nn -p e2h-policy --features "$(IFS=,; echo "${members[*]}")")
+common+=(-p auto-e2h -p e2h-nn -p e2h-policy --features auto-e2h/cuda,e2h-nn/cuda,e2h-policy/cuda)
 examples=(--example peer --example nut_assembly --example evaluate)
 tests=(--test nn --test candle --test golden)
 
@@ -89,7 +86,7 @@ cp "$built/examples/peer" "$built/examples/nut_assembly" "$built/examples/evalua
 cp "$(find "$built/build" -name 'libmujoco.so.*' -size +1M | head -1)" "$dist"
 strip "$dist"/test.* "$dist"/peer "$dist"/nut_assembly "$dist"/evaluate
 for program in "$dist"/test.* "$dist"/peer "$dist"/nut_assembly "$dist"/evaluate; do
-    if readelf -d "$program" | grep -E 'NEEDED.*lib(cu|nv|nccl)'; then
+    if readelf -d "$program" | grep -E 'NEEDED.*lib(cu|nv)'; then
         echo "$program still needs a CUDA library to start" >&2
         exit 1
     fi

@@ -1,28 +1,42 @@
 #!/usr/bin/env bash
-# On a machine with a GPU: the tests of the networks there, our speed, PyTorch's, and a short run of the whole method.
+# On a machine with a GPU: the tests of the networks there, our speed beside PyTorch's, and a stage of the method at the paper's size.
 #
-#   benches/cuda/run.sh [test] [peer] [torch] [loop]       (without words: all of them)
+#   benches/cuda/run.sh [test] [compare] [stage] [loop]       (without words: all of them, within ten minutes)
 #
 #   DEVICE=cuda     or cuda:N
+#   ROUNDS=3        of compare, ours and PyTorch's in turn, the median of REPEATS=20 runs each
+#   PYTHON=python3  for compare: one with torch and lerobot 0.4.4; where it has not, they are installed below target/peers
 #
-# Starts what benches/cuda/build.sh left in target/cuda/dist. Needs NVIDIA's driver (580 or newer), and Python with pip for
-# the libraries (cuBLAS and cuRAND, about 600 MB) and, for torch, lerobot 0.4.4; a CUDA 13 toolkit will do for the former.
+# Starts what benches/cuda/build.sh left in target/cuda/dist. Needs NVIDIA's driver (580 or newer) and cuBLAS and cuRAND 13: a
+# toolkit's, those beside torch in PYTHON, or else as Python packages below target/cuda/run (about 600 MB).
 set -euo pipefail
 cd "$(dirname "$0")/../.."
-root=$PWD dist=$PWD/target/cuda/dist venv=$PWD/target/cuda/run device=${DEVICE:-cuda}
-[ $# -gt 0 ] || set -- test peer torch loop
+root=$PWD dist=$PWD/target/cuda/dist venv=$PWD/target/cuda/run device=${DEVICE:-cuda} python=${PYTHON:-python3}
+[ $# -gt 0 ] || set -- test compare stage loop
 if [ ! -x "$dist/peer" ]; then
     echo "run.sh: expected $dist/peer, found none; build it with benches/cuda/build.sh" >&2
     exit 1
 fi
-if ! ls /usr/local/cuda/lib64/libcublas.so.13 "$venv"/lib/python3*/site-packages/nvidia/cu13/lib/libcublas.so.13 >/dev/null 2>&1; then
-    python3 -m venv "$venv"
-    "$venv/bin/pip" install --quiet --disable-pip-version-check --only-binary :all: "nvidia-cublas>=13,<14" "nvidia-curand>=10.4,<11"
+
+packages() { "$1" -c 'import site, sysconfig; print(*{sysconfig.get_paths()["purelib"], *site.getsitepackages()}, sep="\n")'; }
+folders=()
+search() {
+    local folder
+    for folder in "$@"; do
+        if [ -e "$folder/libcublas.so.13" ] || [ -e "$folder/libcurand.so.10" ]; then folders+=("$folder"); fi
+    done
+}
+while read -r site; do search "$site"/nvidia/*/lib; done < <(packages "$python")
+search /usr/local/cuda/lib64 /usr/local/cuda/targets/x86_64-linux/lib
+if [ ${#folders[@]} -eq 0 ]; then
+    if [ ! -x "$venv/bin/python" ]; then
+        "$python" -m venv "$venv"
+        "$venv/bin/pip" install --quiet --disable-pip-version-check --only-binary :all: "nvidia-cublas>=13,<14" "nvidia-curand>=10.4,<11"
+    fi
+    while read -r site; do search "$site"/nvidia/*/lib; done < <(packages "$venv/bin/python")
 fi
-for folder in "$venv"/lib/python3*/site-packages/nvidia/*/lib /usr/local/cuda/lib64; do
-    [ ! -d "$folder" ] || LD_LIBRARY_PATH=$folder:${LD_LIBRARY_PATH:-}
-done
-export LD_LIBRARY_PATH
+LIBRARIES=$(IFS=:; echo "${folders[*]}")${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}
+ours() { LD_LIBRARY_PATH=$LIBRARIES "$@"; }
 # The driver compiles each kernel on its first use and keeps it here.
 export CUDA_CACHE_PATH=${CUDA_CACHE_PATH:-$root/target/cuda/kernels} CUDA_CACHE_MAXSIZE=4294967296
 
@@ -32,30 +46,42 @@ for what in "$@"; do
             for program in "$dist"/test.*; do
                 package=$(basename "$program" | cut -d. -f2)
                 # Every comparison with our kernels and with LeRobot's numbers, on the GPU. One thread: one stream.
-                (cd "crates/$package" && E2H_TEST_DEVICE=$device "$program" --test-threads 1)
+                (cd "crates/$package" && E2H_TEST_DEVICE=$device ours "$program" --test-threads 1 --skip examples::)
             done ;;
-        peer)
-            for size in laptop paper; do
-                for options in "" --tf32 --bf16; do
-                    # shellcheck disable=SC2086
-                    "$dist/peer" --json --device "$device" --size $size $options
-                done
-            done ;;
-        torch)
+        compare)
             peers=target/peers
-            if ! "$peers/venv/bin/python" -c 'import lerobot, torch' 2>/dev/null; then
-                python3 -m venv "$peers/venv"
-                "$peers/venv/bin/pip" install --quiet "lerobot==0.4.4"
+            mkdir -p "$peers"
+            if ! "$python" -c 'import diffusers, lerobot, torch' 2>/dev/null; then
+                if ! "$peers/venv/bin/python" -c 'import lerobot, torch' 2>/dev/null; then
+                    python3 -m venv "$peers/venv"
+                    "$peers/venv/bin/pip" install --quiet "lerobot==0.4.4"
+                fi
+                python=$PWD/$peers/venv/bin/python
             fi
-            for size in laptop paper; do
-                env -u LD_LIBRARY_PATH "$peers/venv/bin/python" -W ignore benches/peers/train_step.py --size $size --device "$device" \
-                    --dump "$peers/$size.safetensors"
-                # The same weights and data: the losses of the first step have to agree.
-                "$dist/peer" --json --device "$device" --size $size --data "$peers/$size.safetensors"
-            done ;;
+            rm -f "$peers"/cuda.*.jsonl
+            for round in $(seq "${ROUNDS:-3}"); do
+                for size in laptop paper; do
+                    echo "round $round: $size" >&2
+                    "$python" -W ignore benches/peers/train_step.py --size $size --device "$device" --precision f32 tf32 bf16 \
+                        --repeats "${REPEATS:-20}" --dump "$peers/$size.safetensors" >>"$peers/cuda.torch.jsonl"
+                    # The same weights and data: the losses of the first step have to agree.
+                    for option in "" --tf32 --bf16; do
+                        # shellcheck disable=SC2086
+                        ours "$dist/peer" --json --device "$device" --size $size $option --repeats "${REPEATS:-20}" \
+                            --data "$peers/$size.safetensors" >>"$peers/cuda.ours.jsonl"
+                    done
+                done
+            done
+            "$python" benches/cuda/table.py "$peers/cuda.ours.jsonl" "$peers/cuda.torch.jsonl" ;;
+        stage)
+            # Demonstrations of the nut and training at the paper's sizes, but few steps: one stage on real episodes.
+            out=$(mktemp -d)
+            ours "$dist/nut_assembly" --preset paper --device "$device" --set device.bf16=true --out "$out/run" \
+                --set loop.demonstrations=4 --set train.easy_steps=100 --set train.initial_steps=100 --set loop.iterations=0 \
+                --set evaluation.trials=2 ;;
         loop)
             out=$(mktemp -d)
-            "$dist/nut_assembly" --preset smoke --device "$device" --out "$out/run" ;;
-        *) echo "run.sh: expected test, peer, torch or loop, found $what" >&2; exit 2 ;;
+            ours "$dist/nut_assembly" --preset smoke --device "$device" --out "$out/run" ;;
+        *) echo "run.sh: expected test, compare, stage or loop, found $what" >&2; exit 2 ;;
     esac
 done

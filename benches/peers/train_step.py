@@ -1,6 +1,7 @@
 """The PyTorch side of the training-step and sampling comparison: LeRobot's own U-Net and spatial softmax.
 
-    python train_step.py [--size laptop|paper] [--threads 2] [--repeats 15] [--device cpu|cuda] [--dump FILE]
+    python train_step.py [--size laptop|paper] [--threads 2] [--repeats 15] [--device cpu|cuda]
+                         [--precision f32 tf32 bf16] [--dump FILE]
 
 Needs lerobot==0.4.4 (compare.sh installs it). Prints one JSON line a variant, medians in milliseconds:
   forward       without gradients
@@ -10,6 +11,7 @@ Needs lerobot==0.4.4 (compare.sh installs it). Prints one JSON line a variant, m
   loss          of the first step
 Variants: "default" (NCHW, Adam foreach) and "tuned" (channels last, fused Adam). The peer to beat is the faster of the two, on an
 otherwise idle machine with OpenMP's defaults.
+--precision, on a GPU: products and convolutions of f32 as they are, on tensor cores (TF32), or under autocast in bf16.
 --dump writes the weights, under LeRobot's names, and the data of the first step, for `cargo run --example peer -- --data FILE`.
 """
 
@@ -39,6 +41,7 @@ parser.add_argument("--batch", type=int)
 parser.add_argument("--threads", type=int, default=2)
 parser.add_argument("--repeats", type=int, default=15)
 parser.add_argument("--device", default="cpu")
+parser.add_argument("--precision", choices=("f32", "tf32", "bf16"), nargs="+", default=["f32"])
 parser.add_argument("--dump")
 args = parser.parse_args()
 width, pixels, dims, batch = SIZES[args.size]
@@ -137,6 +140,13 @@ def data(size, channels_last):
     return images, *(t.to(device) for t in (state, actions, timesteps, noise))
 
 
+precision = args.precision[0]
+
+
+def lower():
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
+
+
 def median(run):
     def wait():
         if device.type == "cuda":
@@ -154,7 +164,8 @@ def median(run):
     return round(statistics.median(times), 2)
 
 
-for variant in ("default", "tuned"):
+for precision, variant in [(p, v) for p in args.precision for v in ("default", "tuned")]:
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = precision == "tf32"
     torch.manual_seed(0)
     tuned = variant == "tuned"
     policy = Policy().to(device)
@@ -174,7 +185,9 @@ for variant in ("default", "tuned"):
 
     def step():
         noisy = schedule.add_noise(actions, noise, timesteps)
-        loss = F.mse_loss(policy(images, state, noisy, timesteps), noise)
+        with lower():
+            prediction = policy(images, state, noisy, timesteps)
+        loss = F.mse_loss(prediction.float(), noise)
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
@@ -183,7 +196,7 @@ for variant in ("default", "tuned"):
         losses.append(loss.item())
 
     def forward():
-        with torch.no_grad():
+        with torch.no_grad(), lower():
             policy(images, state, actions, timesteps)
 
     def ddim(size):
@@ -191,14 +204,18 @@ for variant in ("default", "tuned"):
 
         def run():
             with torch.no_grad():
-                condition, y = policy.condition(pictures, states), start
+                with lower():
+                    condition = policy.condition(pictures, states)
+                y = start
                 for k in schedule.timesteps:
                     t = torch.full((size,), int(k), device=device)
-                    y = schedule.step(policy.unet(y, t, global_cond=condition), k, y, eta=0.0).prev_sample
+                    with lower():
+                        output = policy.unet(y, t, global_cond=condition)
+                    y = schedule.step(output.float(), k, y, eta=0.0).prev_sample
 
         return run
 
-    line = {"peer": "torch " + torch.__version__, "variant": variant, "size": args.size, "device": args.device}
+    line = {"peer": "torch " + torch.__version__, "variant": variant, "size": args.size, "device": args.device, "precision": precision}
     line |= {"batch": batch, "threads": args.threads, "params": sum(p.numel() for p in policy.parameters())}
     line |= {"forward": median(forward), "step": median(step), "ddim1": median(ddim(1)), "ddim8": median(ddim(8))}
     line |= {"rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024, "loss": losses[0]}

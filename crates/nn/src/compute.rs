@@ -6,8 +6,8 @@ thread_local! {
     static CANDLE: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Runs `f` with networks that are built inside, and operations without weights, on Candle's operations instead of the
-/// kernels for the CPU: the arithmetic of a GPU, on any machine. For tests and measurements.
+/// Runs `f` with networks that are built inside, and operations without weights, on Candle's operations instead of our
+/// kernels: what other devices compute with, on any machine. For tests and measurements.
 #[doc(hidden)]
 pub fn candle_operations<R>(f: impl FnOnce() -> R) -> R {
     struct Restore(bool);
@@ -27,16 +27,26 @@ pub(crate) enum Backend {
     Kernels,
     /// Candle's operations, which Candle tracks: gradients are tensors.
     Candle,
+    /// Our kernels on an NVIDIA GPU: a tape records their launches, gradients are tensors.
+    #[cfg_attr(not(feature = "cuda"), allow(dead_code, reason = "made with feature cuda alone"))]
+    Gpu,
 }
 
 impl Backend {
-    fn on(cpu: bool) -> Self {
-        if CANDLE.get() || !cpu { Self::Candle } else { Self::Kernels }
+    fn on(device: &Device) -> Self {
+        match device {
+            _ if CANDLE.get() => Self::Candle,
+            Device::Cpu => Self::Kernels,
+            #[cfg(feature = "cuda")]
+            Device::Cuda(_) => Self::Gpu,
+            _ => Self::Candle,
+        }
     }
 
     /// For an operation without weights.
     pub(crate) fn of(inputs: &[&Tensor]) -> Self {
-        Self::on(inputs.iter().all(|t| t.device().is_cpu()))
+        let elsewhere = inputs.iter().map(|t| t.device()).find(|d| !d.is_cpu());
+        Self::on(elsewhere.unwrap_or(&Device::Cpu))
     }
 }
 
@@ -128,7 +138,7 @@ impl Compute {
 
     /// What computes networks that are built now.
     pub(crate) fn backend(&self) -> Backend {
-        Backend::on(self.device.is_cpu())
+        Backend::on(&self.device)
     }
 }
 
@@ -137,14 +147,33 @@ fn cuda(_: usize) -> std::result::Result<Device, String> {
     Err("this program was built without CUDA; build it with `--features cuda`, or use cpu".to_owned())
 }
 
+/// Devices that were opened: tensors of one GPU understand each other however often its name is given.
+#[cfg(feature = "cuda")]
+static OPENED: std::sync::Mutex<Vec<(usize, Device)>> = std::sync::Mutex::new(Vec::new());
+
 #[cfg(feature = "cuda")]
 fn cuda(number: usize) -> std::result::Result<Device, String> {
+    let mut opened = OPENED.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    if let Some((_, device)) = opened.iter().find(|(n, _)| *n == number) {
+        return Ok(device.clone());
+    }
+    let device = cuda_anew(number)?;
+    opened.push((number, device.clone()));
+    Ok(device)
+}
+
+#[cfg(feature = "cuda")]
+fn cuda_anew(number: usize) -> std::result::Result<Device, String> {
     // The loader of the driver panics where a library is missing. Its message would be a second one, in other words.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     // A stream of its own orders tensors that threads share; the default stream is one for each thread.
     // The text of an error is the driver's too.
-    let open = || Device::new_cuda_with_stream(number).map_err(|e| e.to_string());
+    let open = || {
+        let device = Device::new_cuda_with_stream(number).map_err(|e| e.to_string())?;
+        crate::gpu::prepare(&device).map_err(|e| e.to_string())?;
+        Ok::<_, String>(device)
+    };
     let opened = std::panic::catch_unwind(open);
     std::panic::set_hook(hook);
     match opened {

@@ -1,7 +1,7 @@
 use crate::compute::Backend;
 use crate::graph;
-use crate::kernel::{self, add_assign};
-use crate::numbers::{Numbers, elsewhere};
+use crate::kernel;
+use crate::numbers::Numbers;
 use crate::params::Params;
 use crate::storage::with;
 use crate::weights::Weights;
@@ -12,7 +12,7 @@ use std::collections::HashMap;
 
 thread_local! {
     /// One list per running `backward` of this thread. Another can start while the first waits for a parallel loop.
-    static RUNNING: RefCell<Vec<HashMap<TensorId, Vec<f32>>>> = const { RefCell::new(Vec::new()) };
+    static RUNNING: RefCell<Vec<HashMap<TensorId, Numbers>>> = const { RefCell::new(Vec::new()) };
     static OFF: Cell<bool> = const { Cell::new(false) };
 }
 
@@ -34,7 +34,7 @@ pub fn no_grad<R>(f: impl FnOnce() -> R) -> R {
 }
 
 /// Adds weight gradients to the list of the innermost `backward`.
-pub(crate) fn give(list: Vec<(TensorId, Vec<f32>)>) -> Result<()> {
+pub(crate) fn give(list: Vec<(TensorId, Numbers)>) -> Result<()> {
     if list.is_empty() {
         return Ok(());
     }
@@ -42,7 +42,7 @@ pub(crate) fn give(list: Vec<(TensorId, Vec<f32>)>) -> Result<()> {
         let store = r.last_mut().ok_or(Error::NotRecording)?;
         for (id, g) in list {
             match store.get_mut(&id) {
-                Some(sum) => add_assign(sum, &g),
+                Some(sum) => sum.add(&g)?,
                 None => {
                     store.insert(id, g);
                 }
@@ -65,6 +65,10 @@ impl Grads {
     /// # Errors
     /// [`Error::Candle`] when a device fails; none on the CPU.
     pub fn norm(&self) -> Result<f32> {
+        #[cfg(feature = "cuda")]
+        if let Some(norm) = self.device_norm()? {
+            return Ok(norm.to_scalar::<f32>()?);
+        }
         let (mut sum, mut elsewhere) = (0.0, Vec::new());
         for g in self.list.iter().flatten() {
             match g {
@@ -77,6 +81,20 @@ impl Grads {
             sum += f64::from(Tensor::stack(&elsewhere, 0)?.sum_all()?.to_scalar::<f32>()?);
         }
         Ok(sum.sqrt() as f32)
+    }
+
+    /// The norm as a scalar on the GPU that all gradients are on, or none.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn device_norm(&self) -> Result<Option<Tensor>> {
+        let mut all = Vec::with_capacity(self.list.len());
+        for g in self.list.iter().flatten() {
+            match g {
+                Numbers::Device(t) if t.device().is_cuda() => all.push(t),
+                _ => return Ok(None),
+            }
+        }
+        let Some(first) = all.first() else { return Ok(None) };
+        Ok(Some(crate::gpu::Gpu::of(first)?.norm(&all)?))
     }
 
     /// Adds `other`, for a batch that is taken in parts.
@@ -93,9 +111,7 @@ impl Grads {
         }
         for (a, b) in self.list.iter_mut().zip(&other.list) {
             match (a, b) {
-                (Some(Numbers::Host(a)), Some(Numbers::Host(b))) => add_assign(a, b),
-                (Some(Numbers::Device(a)), Some(Numbers::Device(b))) => *a = (&*a + b)?,
-                (Some(_), Some(_)) => return Err(elsewhere("gradients", other.list.len())),
+                (Some(a), Some(b)) => a.add(b)?,
                 (a @ None, Some(b)) => *a = Some(b.clone()),
                 (_, None) => {}
             }
@@ -188,13 +204,16 @@ pub fn backward_many(loss: &Tensor, networks: &[&Params]) -> Result<Vec<Grads>> 
             let mut g = found.remove(&var.as_tensor().id());
             // A variable used through Candle's own operations has its gradient there.
             if let Some(t) = store.get(var.as_tensor()) {
-                let more = with(&t.contiguous()?, <[f32]>::to_vec)?;
+                let more = match params.backend() {
+                    Backend::Kernels => Numbers::Host(with(&t.contiguous()?, <[f32]>::to_vec)?),
+                    _ => Numbers::Device(t.contiguous()?),
+                };
                 match &mut g {
-                    Some(g) => add_assign(g, &more),
+                    Some(g) => g.add(&more)?,
                     None => g = Some(more),
                 }
             }
-            list.push(g.map(Numbers::Host));
+            list.push(g);
         }
         out.push(Grads { list });
     }

@@ -45,6 +45,8 @@
 mod builder;
 mod compute;
 mod error;
+#[cfg(feature = "cuda")]
+mod gpu;
 mod grad;
 mod graph;
 mod kernel;

@@ -70,6 +70,10 @@ pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Res
         });
     }
     run(&[prediction, target], None, |tape, n| {
+        #[cfg(feature = "cuda")]
+        if tape.on_gpu() {
+            return crate::gpu::squared_error(tape, (n[0], n[1]), &weights, width, (1.0 / count) as f32);
+        }
         if tape.in_graph() {
             let (p, t) = (tape.tensor(n[0])?, tape.tensor(n[1])?);
             return Ok(tape.put(graph::act::squared_error(p, t, &weights, 1.0 / count)?));

@@ -1,4 +1,5 @@
 use crate::compute::Backend;
+use crate::kernel::add_assign;
 use crate::storage::{host, with};
 use crate::{Error, Result};
 use candle_core::{Tensor, Var};
@@ -23,7 +24,7 @@ impl Numbers {
     pub(crate) fn zeros(var: &Var, backend: Backend) -> Result<Self> {
         match backend {
             Backend::Kernels => Ok(Self::Host(vec![0.0; var.elem_count()])),
-            Backend::Candle => Ok(Self::Device(var.zeros_like()?)),
+            Backend::Candle | Backend::Gpu => Ok(Self::Device(var.zeros_like()?)),
         }
     }
 
@@ -31,7 +32,7 @@ impl Numbers {
     pub(crate) fn copy(var: &Var, backend: Backend) -> Result<Self> {
         match backend {
             Backend::Kernels => with(var.as_tensor(), |v| Self::Host(v.to_vec())),
-            Backend::Candle => Ok(Self::Device(var.as_detached_tensor().force_contiguous()?)),
+            Backend::Candle | Backend::Gpu => Ok(Self::Device(var.as_detached_tensor().force_contiguous()?)),
         }
     }
 
@@ -40,6 +41,25 @@ impl Numbers {
             Self::Host(v) => v.len(),
             Self::Device(t) => t.elem_count(),
         }
+    }
+
+    /// A copy that shares no memory with it.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn apart(&self) -> Result<Self> {
+        match self {
+            Self::Host(v) => Ok(Self::Host(v.clone())),
+            Self::Device(t) => Ok(Self::Device(t.force_contiguous()?)),
+        }
+    }
+
+    /// Adds `other`, of the same parameter.
+    pub(crate) fn add(&mut self, other: &Self) -> Result<()> {
+        match (self, other) {
+            (Self::Host(a), Self::Host(b)) => add_assign(a, b),
+            (Self::Device(a), Self::Device(b)) => *a = (&*a + b)?,
+            _ => return Err(elsewhere("gradients", 1)),
+        }
+        Ok(())
     }
 
     pub(crate) fn host(&self) -> Result<Cow<'_, [f32]>> {

@@ -170,7 +170,7 @@ impl Params {
     pub fn export(&self) -> Result<Weights> {
         let mut out = Weights::new();
         for (name, p) in self.params.iter() {
-            let tensor = if self.backend == Backend::Candle {
+            let tensor = if self.backend != Backend::Kernels {
                 p.outward(&host(p.var.as_tensor())?)
             } else {
                 with(p.var.as_tensor(), |d| p.outward(d))?
@@ -188,7 +188,7 @@ impl Params {
         self.matches(weights)?;
         for (param, tensor) in self.params.values().zip(weights.values()) {
             let data = param.inward(&tensor.data);
-            if self.backend == Backend::Candle {
+            if self.backend != Backend::Kernels {
                 param.var.set(&Tensor::from_vec(data, param.var.shape(), param.var.device())?)?;
             } else {
                 edit(&param.var, |p| p.copy_from_slice(&data))?;
@@ -209,7 +209,7 @@ impl Params {
             return Err(Error::OtherParams { what: "parameters to follow", expected, found });
         }
         for (ours, theirs) in self.variables().zip(other.variables()) {
-            if self.backend == Backend::Candle {
+            if self.backend != Backend::Kernels {
                 let theirs = theirs.as_detached_tensor();
                 let moved = if part < 1.0 {
                     graph::optim::blend(&ours.as_detached_tensor(), &theirs, part)?

@@ -4,12 +4,14 @@
 //! the first gradient of a value is moved and only further ones are added, and weight gradients go straight to the list
 //! that [`crate::backward`] collects.
 //!
-//! On other devices nothing is recorded: values are tensors that Candle tracks, see [`crate::graph`].
+//! On NVIDIA GPUs a tape records launches in the same way (`gpu`). On other devices nothing is recorded: values are tensors
+//! that Candle tracks, see [`crate::graph`].
 
 use crate::builder::Weight;
 use crate::compute::Backend;
 use crate::grad;
 use crate::kernel::add_assign;
+use crate::numbers::Numbers;
 use crate::storage::slice;
 use crate::{Error, Result};
 use candle_core::{
@@ -21,6 +23,13 @@ use std::sync::Mutex;
 /// The number of a value on a tape.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Node(usize);
+
+#[cfg(feature = "cuda")]
+impl Node {
+    pub(crate) fn index(self) -> usize {
+        self.0
+    }
+}
 
 enum Value {
     Own(Vec<f32>),
@@ -47,6 +56,9 @@ pub(crate) trait Step: Send + Sync {
 pub(crate) struct Tape {
     slots: Vec<Slot>,
     steps: Vec<(Node, Box<dyn Step>)>,
+    /// The same on a GPU.
+    #[cfg(feature = "cuda")]
+    device_steps: Vec<(Node, crate::gpu::Step)>,
     record: bool,
     backend: Backend,
 }
@@ -91,6 +103,48 @@ impl Tape {
             Value::Given(t) => read(t),
             Value::Tracked(_) | Value::Gone => Err(Error::NotRecording),
         }
+    }
+
+    #[cfg(feature = "cuda")]
+    pub(crate) fn backend(&self) -> Backend {
+        self.backend
+    }
+
+    /// Whether there will be a way back.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn recording(&self) -> bool {
+        self.record
+    }
+
+    /// Adds an input that is on a GPU.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn given(&mut self, tensor: Tensor, grad: bool) -> Node {
+        let node = Node(self.slots.len());
+        let shape = tensor.dims().to_vec();
+        self.slots.push(Slot { value: Value::Tracked(tensor), shape, grad });
+        node
+    }
+
+    /// Adds a result that is on a GPU. `step` is kept if something needs a gradient through it, as `wanted` says.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn push_device(
+        &mut self,
+        value: Tensor,
+        wanted: bool,
+        step: impl FnOnce(&Tensor, &mut crate::gpu::Flow) -> Result<()> + Send + 'static,
+    ) -> Node {
+        let grad = self.record && wanted;
+        let node = self.given(value, grad);
+        if grad {
+            self.device_steps.push((node, Box::new(step)));
+        }
+        node
+    }
+
+    /// How many values there are, and the steps to take back.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn into_device_steps(self) -> (usize, Vec<(Node, crate::gpu::Step)>) {
+        (self.slots.len(), self.device_steps)
     }
 
     /// Whether layers are to compute with Candle's operations, on [`Tape::tensor`] and [`Tape::put`].
@@ -171,7 +225,7 @@ impl Values<'_> {
 /// Gradients on their way back.
 pub(crate) struct Flow {
     grads: Vec<Option<Vec<f32>>>,
-    pub(crate) weights: Vec<(TensorId, Vec<f32>)>,
+    pub(crate) weights: Vec<(TensorId, Numbers)>,
 }
 
 impl Flow {
@@ -185,7 +239,7 @@ impl Flow {
     /// A part of the gradient of a weight.
     pub(crate) fn weight(&mut self, w: &Weight, g: Vec<f32>) {
         if w.train {
-            self.weights.push((w.tensor.id(), g));
+            self.weights.push((w.tensor.id(), Numbers::Host(g)));
         }
     }
 }
@@ -326,7 +380,18 @@ pub(crate) fn run(
     let anchor = weight.filter(|w| w.train).map(|w| &w.tensor);
     let record = grad::enabled() && (anchor.is_some() || inputs.iter().any(|t| t.track_op()));
     let backend = weight.map_or_else(|| Backend::of(inputs), |w| w.backend);
-    let mut tape = Tape { slots: Vec::new(), steps: Vec::new(), record, backend };
+    let mut tape = Tape {
+        slots: Vec::new(),
+        steps: Vec::new(),
+        #[cfg(feature = "cuda")]
+        device_steps: Vec::new(),
+        record,
+        backend,
+    };
+    #[cfg(feature = "cuda")]
+    if backend == Backend::Gpu {
+        return crate::gpu::run(tape, inputs, weight, f);
+    }
     if backend == Backend::Candle {
         return run_tracked(tape, inputs, weight, f);
     }

@@ -199,11 +199,12 @@ impl Trainer {
         // A stream per step: nothing of the generator has to be stored for an exact resume.
         let mut rng = stream(self.seed, &self.purpose, 0, self.step as u64);
         let loss = self.loss(data, &mut rng)?;
+        let grads = backward(&loss, &self.model.params)?;
+        // Read only now: a GPU is waited for here, and has all of the way back to do meanwhile.
         let value = loss.to_scalar::<f32>()?;
         if !value.is_finite() {
             return Err(Error::NotFinite { step: self.step, seed: self.seed, loss: value });
         }
-        let grads = backward(&loss, &self.model.params)?;
         let lr = learning_rate(&self.schedule, self.step);
         let norm = self.adam.step(&self.model.params, &grads, lr)?;
         self.skipped.after(norm, self.step, self.seed)?;

@@ -1,4 +1,4 @@
-//! A policy and a critic through Candle's operations, which a GPU computes with, against our kernels.
+//! A policy and a critic through Candle's operations, or a GPU, against our kernels.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot be set up should fail")]
 

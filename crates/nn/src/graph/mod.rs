@@ -59,6 +59,8 @@ struct Formula<F> {
     /// Until Candle takes it.
     value: Mutex<Option<Tensor>>,
     back: F,
+    /// Whether every argument that wants a gradient has to get one.
+    complete: bool,
 }
 
 /// `value`, which was computed from `arguments`, with `back` for its gradient: a layer of your own, on any device.
@@ -103,9 +105,26 @@ where
     if !enabled() || !arguments.iter().any(|a| a.track_op()) {
         return Ok(value);
     }
+    apply(value, arguments, back, true)
+}
+
+/// [`with_gradient`] for a whole network: it may answer for an argument with nothing, because the gradients of weights go
+/// elsewhere.
+#[cfg(feature = "cuda")]
+pub(crate) fn network<F>(value: Tensor, arguments: &[&Tensor], back: F) -> Result<Tensor>
+where
+    F: Fn(&Given<'_>, &Tensor) -> Result<Gradients> + Send + Sync + 'static,
+{
+    apply(value, arguments, back, false)
+}
+
+fn apply<F>(value: Tensor, arguments: &[&Tensor], back: F, complete: bool) -> Result<Tensor>
+where
+    F: Fn(&Given<'_>, &Tensor) -> Result<Gradients> + Send + Sync + 'static,
+{
     let whole = value.is_contiguous() && value.layout().start_offset() == 0;
     let value = if whole { value } else { value.force_contiguous()? };
-    let formula = Formula { value: Mutex::new(Some(value)), back };
+    let formula = Formula { value: Mutex::new(Some(value)), back, complete };
     match arguments {
         [a] => a.apply_op1(formula),
         [a, b] => a.apply_op2(b, formula),
@@ -144,7 +163,7 @@ where
         for (i, (a, g)) in given.arguments.iter().zip(&gradients).enumerate() {
             // Candle would panic.
             let found = g.as_ref().map(Tensor::dims);
-            if found.is_some_and(|d| d != a.dims()) || found.is_none() && a.track_op() {
+            if found.is_some_and(|d| d != a.dims()) || found.is_none() && a.track_op() && self.complete {
                 let expected = format!("{:?} for argument {i}", a.dims());
                 let found = found.unwrap_or_default().to_vec();
                 return Err(Error::Shape { what: "gradient", expected, found }.into());

@@ -16,6 +16,11 @@ pub(crate) struct Convolution {
 
 impl Convolution {
     pub(crate) fn record(self, tape: &mut Tape, shape: Vec<usize>) -> Result<Node> {
+        #[cfg(feature = "cuda")]
+        if tape.on_gpu() {
+            let weights = (&self.weight, self.bias.as_ref());
+            return crate::gpu::convolution(tape, self.x, weights, &self.geo, false, shape);
+        }
         if tape.in_graph() {
             let (w, bias) = (tape.weight(&self.weight), self.bias.as_ref().map(|b| tape.weight(b)));
             let x = tape.tensor(self.x)?;
@@ -229,6 +234,11 @@ impl ConvTranspose1d {
         // The sizes of the convolution whose input gradient this is.
         let (c, n, kw) = (self.to, self.from, Self::KERNEL);
         let geo = Geo { b, h: 1, w: 2 * l, c, n, kh: 1, kw, sh: 1, sw: 2, ph: 0, pw: 1 };
+        #[cfg(feature = "cuda")]
+        if tape.on_gpu() {
+            let weights = (&self.weight, Some(&self.bias));
+            return crate::gpu::convolution(tape, x, weights, &geo, true, vec![b, 2 * l, c]);
+        }
         if tape.in_graph() {
             let (w, bias) = (tape.weight(&self.weight), tape.weight(&self.bias));
             let y = graph::linear::transposed(tape.tensor(x)?, &w, &bias, &geo, self.weight.bf16)?;

@@ -48,6 +48,10 @@ impl Step for MishStep {
 }
 
 pub(crate) fn mish(tape: &mut Tape, x: Node) -> Result<Node> {
+    #[cfg(feature = "cuda")]
+    if tape.on_gpu() {
+        return crate::gpu::mish(tape, x);
+    }
     if tape.in_graph() {
         return Ok(tape.put(graph::act::mish(tape.tensor(x)?)?));
     }
@@ -69,6 +73,10 @@ impl Step for ReluStep {
 }
 
 pub(crate) fn relu(tape: &mut Tape, x: Node) -> Result<Node> {
+    #[cfg(feature = "cuda")]
+    if tape.on_gpu() {
+        return crate::gpu::relu(tape, x);
+    }
     if tape.in_graph() {
         return Ok(tape.put(graph::act::relu(tape.tensor(x)?)?));
     }
@@ -97,6 +105,10 @@ pub(crate) fn add(tape: &mut Tape, a: Node, b: Node) -> Result<Node> {
     if tape.shape(a) != tape.shape(b) {
         let expected = format!("{:?}", tape.shape(a));
         return Err(Error::Shape { what: "second summand", expected, found: tape.shape(b).to_vec() });
+    }
+    #[cfg(feature = "cuda")]
+    if tape.on_gpu() {
+        return crate::gpu::add(tape, a, b);
     }
     if tape.in_graph() {
         return Ok(tape.put((tape.tensor(a)? + tape.tensor(b)?)?));
@@ -129,6 +141,10 @@ impl Film {
                     return Err(Error::Shape { what: "scale and shift", expected, found: found.to_vec() });
                 }
             };
+            #[cfg(feature = "cuda")]
+            if t.on_gpu() {
+                return crate::gpu::film(t, n[0], n[1], steps, c);
+            }
             if t.in_graph() {
                 return Ok(t.put(graph::act::film(t.tensor(n[0])?, t.tensor(n[1])?)?));
             }
@@ -196,6 +212,12 @@ pub(crate) fn concat(tape: &mut Tape, parts: &[Node]) -> Result<Node> {
         }
         widths.push(width);
     }
+    #[cfg(feature = "cuda")]
+    if tape.on_gpu() {
+        let parts: Vec<_> = parts.iter().copied().zip(widths.iter().copied()).collect();
+        shape.push(widths.iter().sum());
+        return crate::gpu::concat(tape, &parts, &shape);
+    }
     if tape.in_graph() {
         let parts: Result<Vec<&Tensor>> = parts.iter().map(|n| tape.tensor(*n)).collect();
         return Ok(tape.put(Tensor::cat(&parts?, shape.len())?));
@@ -228,6 +250,10 @@ impl Step for Masked {
 }
 
 pub(crate) fn masked(tape: &mut Tape, x: Node, mask: Vec<f32>) -> Result<Node> {
+    #[cfg(feature = "cuda")]
+    if tape.on_gpu() {
+        return crate::gpu::masked(tape, x, mask);
+    }
     if tape.in_graph() {
         let x = tape.tensor(x)?;
         return Ok(tape.put((x * Tensor::from_vec(mask, x.shape(), x.device())?)?));
@@ -292,6 +318,10 @@ pub fn repeat_rows(x: &Tensor, times: usize) -> Result<Tensor> {
         return Err(Error::Config { what: "times to repeat", expected: "at least 1", found: "0".into() });
     }
     run(&[x], None, |t, n| {
+        #[cfg(feature = "cuda")]
+        if t.on_gpu() {
+            return crate::gpu::repeat_rows(t, n[0], times);
+        }
         if t.in_graph() {
             return Ok(t.put(graph::act::repeat_rows(t.tensor(n[0])?, times)?));
         }

@@ -108,6 +108,16 @@ impl GroupNorm {
         if let Some(o) = other.filter(|o| tape.shape(*o) != expected) {
             return Err(wrong("second input of group norm", format!("{expected:?}"), tape.shape(o)));
         }
+        let dims = Dims {
+            b: shape[0],
+            s: shape[1..shape.len() - 1].iter().product(),
+            c: self.channels,
+            groups: self.groups,
+        };
+        #[cfg(feature = "cuda")]
+        if tape.on_gpu() {
+            return crate::gpu::group_norm(tape, x, other, (&self.gain, &self.bias), post, &dims);
+        }
         if tape.in_graph() {
             let (gain, bias) = (tape.weight(&self.gain), tape.weight(&self.bias));
             let z = graph::norm::group_norm(tape.tensor(x)?, &gain, &bias, self.groups)?;
@@ -122,12 +132,6 @@ impl GroupNorm {
             };
             return Ok(tape.put(y));
         }
-        let dims = Dims {
-            b: shape[0],
-            s: shape[1..shape.len() - 1].iter().product(),
-            c: self.channels,
-            groups: self.groups,
-        };
         let extra = other.map(|o| tape.read(o)).transpose()?;
         let (gain, bias) = (read(&self.gain.tensor)?, read(&self.bias.tensor)?);
         let (y, stats) =

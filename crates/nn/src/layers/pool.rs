@@ -33,6 +33,10 @@ impl MaxPool2d {
 
     pub(crate) fn record(self, tape: &mut Tape, x: Node) -> Result<Node> {
         let map = map(tape, x, "max pool input")?;
+        #[cfg(feature = "cuda")]
+        if tape.on_gpu() {
+            return crate::gpu::max_pool(tape, x, &map);
+        }
         if tape.in_graph() {
             return Ok(tape.put(graph::pool::max_pool(tape.tensor(x)?, &map)?));
         }
@@ -90,6 +94,10 @@ impl SpatialSoftmax {
     pub(crate) fn record(&self, tape: &mut Tape, x: Node) -> Result<Node> {
         let logits = self.nets.record(tape, x)?;
         let map = map(tape, logits, "spatial softmax input")?;
+        #[cfg(feature = "cuda")]
+        if tape.on_gpu() {
+            return crate::gpu::keypoints(tape, logits, &map);
+        }
         if tape.in_graph() {
             return Ok(tape.put(graph::pool::keypoints(tape.tensor(logits)?, &map)?));
         }

@@ -85,6 +85,9 @@ pub struct Adam {
     mean: Vec<Numbers>,
     square: Vec<Numbers>,
     steps: u64,
+    /// A GPU changes the moments in place: clones part before.
+    #[cfg(feature = "cuda")]
+    shared: std::sync::Arc<()>,
 }
 
 /// Steps are stored as two numbers that `f32` holds exactly: thousands of 2^20, and the rest.
@@ -97,10 +100,60 @@ impl Adam {
     /// [`Error::Config`] names the first setting that does not work; [`Error::Candle`] when a device fails.
     pub fn new(config: &AdamConfig, params: &Params) -> Result<Self> {
         config.validate()?;
-        let zeros: Result<Vec<Numbers>> =
-            params.variables().map(|v| Numbers::zeros(v, params.backend())).collect();
-        let mean = zeros?;
-        Ok(Self { config: *config, params: params.clone(), square: mean.clone(), mean, steps: 0 })
+        let zeros = || -> Result<Vec<Numbers>> {
+            params.variables().map(|v| Numbers::zeros(v, params.backend())).collect()
+        };
+        Ok(Self {
+            config: *config,
+            params: params.clone(),
+            mean: zeros()?,
+            square: zeros()?,
+            steps: 0,
+            #[cfg(feature = "cuda")]
+            shared: std::sync::Arc::default(),
+        })
+    }
+
+    /// The numbers of step number `steps`, with gradients multiplied by `clip`.
+    fn numbers(&self, steps: u64, lr: f32, clip: f32) -> optim::Adam {
+        let c = &self.config;
+        let correction = |beta: f32| 1.0 - f64::from(beta).powf(steps as f64);
+        optim::Adam {
+            rate: (f64::from(lr) / correction(c.beta1)) as f32,
+            beta1: c.beta1,
+            beta2: c.beta2,
+            eps: c.eps,
+            root: (1.0 / correction(c.beta2).sqrt()) as f32,
+            clip,
+            decay: if c.decoupled { 0.0 } else { c.weight_decay },
+            keep: if c.decoupled { 1.0 - lr * c.weight_decay } else { 1.0 },
+        }
+    }
+
+    /// [`Adam::step`] on a GPU: norm, clipping and step follow each other there, and the norm is waited for at the end.
+    #[cfg(feature = "cuda")]
+    fn device_step(&mut self, params: &Params, grads: &Grads, lr: f32) -> Result<f32> {
+        let Some(norm) = grads.device_norm()? else { return Ok(0.0) };
+        if std::sync::Arc::strong_count(&self.shared) > 1 {
+            let apart = |list: &[Numbers]| list.iter().map(Numbers::apart).collect::<Result<Vec<_>>>();
+            (self.mean, self.square) = (apart(&self.mean)?, apart(&self.square)?);
+            self.shared = std::sync::Arc::default();
+        }
+        let now: Vec<_> = params.variables().map(|v| v.as_detached_tensor()).collect();
+        let mut rows = Vec::with_capacity(now.len());
+        for ((p, g), (m, v)) in now.iter().zip(&grads.list).zip(self.mean.iter().zip(&self.square)) {
+            match (g, m, v) {
+                (None, _, _) => {}
+                (Some(Numbers::Device(g)), Numbers::Device(m), Numbers::Device(v)) => rows.push([p, g, m, v]),
+                _ => return Err(elsewhere("gradients", params.len())),
+            }
+        }
+        let numbers = self.numbers(self.steps + 1, lr, 1.0);
+        crate::gpu::Gpu::of(&norm)?.adam(&rows, &norm, &numbers, self.config.clip_norm)?;
+        let norm = norm.to_scalar::<f32>()?;
+        // The device has left everything as it was otherwise.
+        self.steps += u64::from(norm.is_finite());
+        Ok(norm)
     }
 
     /// How many steps were made.
@@ -124,23 +177,17 @@ impl Adam {
     pub fn step(&mut self, params: &Params, grads: &Grads, lr: f32) -> Result<f32> {
         grads.check(params)?;
         self.check(params)?;
+        #[cfg(feature = "cuda")]
+        if params.backend() == crate::compute::Backend::Gpu {
+            return self.device_step(params, grads, lr);
+        }
         let norm = grads.norm()?;
         if !norm.is_finite() {
             return Ok(norm);
         }
         self.steps += 1;
-        let c = &self.config;
-        let correction = |beta: f32| 1.0 - f64::from(beta).powf(self.steps as f64);
-        let step = optim::Adam {
-            rate: (f64::from(lr) / correction(c.beta1)) as f32,
-            beta1: c.beta1,
-            beta2: c.beta2,
-            eps: c.eps,
-            root: (1.0 / correction(c.beta2).sqrt()) as f32,
-            clip: c.clip_norm.map_or(1.0, |max| (max / (norm + 1e-6)).min(1.0)),
-            decay: if c.decoupled { 0.0 } else { c.weight_decay },
-            keep: if c.decoupled { 1.0 - lr * c.weight_decay } else { 1.0 },
-        };
+        let clip = self.config.clip_norm.map_or(1.0, |max| (max / (norm + 1e-6)).min(1.0));
+        let step = self.numbers(self.steps, lr, clip);
         let moments = self.mean.iter_mut().zip(&mut self.square);
         for ((var, g), (m, v)) in params.variables().zip(&grads.list).zip(moments) {
             match (g, m, v) {

@@ -56,6 +56,9 @@ pub struct Ema {
     params: Params,
     average: Vec<Numbers>,
     updates: u64,
+    /// A GPU changes `average` in place: clones part before.
+    #[cfg(feature = "cuda")]
+    shared: std::sync::Arc<()>,
 }
 
 /// Updates are stored as two numbers that `f32` holds exactly.
@@ -69,7 +72,24 @@ impl Ema {
     pub fn new(config: &EmaConfig, params: &Params) -> Result<Self> {
         config.validate()?;
         let average: Result<_> = params.variables().map(|v| Numbers::copy(v, params.backend())).collect();
-        Ok(Self { config: *config, params: params.clone(), average: average?, updates: 0 })
+        Ok(Self {
+            config: *config,
+            params: params.clone(),
+            average: average?,
+            updates: 0,
+            #[cfg(feature = "cuda")]
+            shared: std::sync::Arc::default(),
+        })
+    }
+
+    /// Makes sure that no clone sees what is changed in place.
+    #[cfg(feature = "cuda")]
+    fn own(&mut self) -> Result<()> {
+        if std::sync::Arc::strong_count(&self.shared) > 1 {
+            self.average = self.average.iter().map(Numbers::apart).collect::<Result<_>>()?;
+            self.shared = std::sync::Arc::default();
+        }
+        Ok(())
     }
 
     /// Moves the average towards the present weights; the first update takes them over.
@@ -84,6 +104,21 @@ impl Ema {
             return Err(Error::OtherParams { what: "moving average", expected, found });
         }
         let part = (1.0 - self.config.decay(self.updates)) as f32;
+        #[cfg(feature = "cuda")]
+        if params.backend() == Backend::Gpu {
+            self.own()?;
+            let mut rows = Vec::with_capacity(self.average.len());
+            let now: Vec<_> = params.variables().map(|v| v.as_detached_tensor()).collect();
+            for (p, a) in now.iter().zip(&self.average) {
+                let Numbers::Device(a) = a else { return Err(elsewhere("moving average", params.len())) };
+                rows.push([a, p]);
+            }
+            if let Some([first, _]) = rows.first() {
+                crate::gpu::Gpu::of(first)?.blend(&rows, part)?;
+            }
+            self.updates += 1;
+            return Ok(());
+        }
         for (var, a) in params.variables().zip(&mut self.average) {
             match a {
                 Numbers::Host(a) if params.backend() == Backend::Kernels => with(var.as_tensor(), |p| {

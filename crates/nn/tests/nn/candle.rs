@@ -1,4 +1,4 @@
-//! Networks, training and state through Candle's operations, which a GPU computes with, against our kernels. The layers are
+//! Networks, training and state through Candle's operations, or a GPU, against our kernels. The layers are
 //! in `gradients.rs`.
 
 use crate::gradients::same_through_candle;
@@ -143,6 +143,29 @@ fn state_crosses_over() {
     let saved = candle.state();
     own.load(&saved);
     assert_eq!(own.state(), saved);
+}
+
+/// A GPU changes moments and average in place: a clone must not see it, and a gradient that is not finite changes nothing.
+#[test]
+fn clones_of_the_optimiser_stay_as_they_were() {
+    let check = || {
+        let mut training = Training::new();
+        training.step(0);
+        let (mut adam, ema) = (training.adam.clone(), training.ema.clone());
+        let before = (adam.state().unwrap(), ema.state().unwrap());
+        training.step(1);
+        assert!(training.adam.state().unwrap() != before.0 && training.ema.state().unwrap() != before.1);
+        assert_eq!((adam.state().unwrap(), ema.state().unwrap()), before);
+        let weights = training.params.export().unwrap();
+        let x = input(1, &[2, 16, 8], f64::INFINITY, 0.0);
+        let y = training.unet.forward(&x, &[1.0, 2.0], &input(2, &[2, 16], 1.0, 0.0)).unwrap();
+        let grads = backward(&y.sum_all().unwrap(), &training.params).unwrap();
+        assert!(!adam.step(&training.params, &grads, 1e-3).unwrap().is_finite());
+        assert_eq!(adam.state().unwrap(), before.0);
+        assert_eq!(training.params.export().unwrap(), weights);
+    };
+    check();
+    elsewhere(check);
 }
 
 /// A network keeps the arithmetic that it was built with; only operations without weights look at the switch.

@@ -47,7 +47,7 @@ fn outcome<T>(
     (values(&out), gradients, weights)
 }
 
-/// Candle's operations, which a GPU computes with, against our kernels.
+/// Candle's operations, or a GPU, against our kernels.
 pub(crate) fn same_through_candle<T>(
     what: &str,
     inputs: &[Tensor],

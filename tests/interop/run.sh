@@ -92,6 +92,11 @@ export E2H_FFMPEG="${E2H_FFMPEG:-$(command -v ffmpeg || "$python" -c 'import ima
 if [ -n "$E2H_FFMPEG" ]; then
     lerobot video "$programs/interop" "$work/video"
     "$programs/dataset" check "$work/video"
+    echo "and a policy trained on it:"
+    "$programs/train" --dataset "$work/video" --preset smoke --quiet --set data.resize=[48,64] --out "$work/trained-video"
+    cp -rL "$work/trained-video/checkpoints/last/pretrained_model" "$work/trained"
+    policies trained "$programs/lerobot_actions" "$work/trained"
+    rm -r "$work/trained"
 else
     echo "NOT RUN: no ffmpeg to decode the video with"
 fi

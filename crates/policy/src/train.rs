@@ -1,6 +1,6 @@
 //! Training of a diffusion policy, one step at a time, exactly resumable.
 
-use crate::batch::BatchBuilder;
+use crate::batch::{BatchBuilder, Part};
 use crate::divergence::{Skipped, sound};
 use crate::examples::TrainingData;
 use crate::lerobot::Features;
@@ -269,16 +269,17 @@ impl Trainer {
         let mut mask = Vec::with_capacity(rows * c.horizon);
         let first_image = c.n_obs_steps - c.n_image_steps;
         let mut indicators = Vec::with_capacity(rows);
-        for example in data.batch(t.conditions, rng) {
+        let examples = data.batch(t.conditions, rng);
+        let mut parts = Vec::new();
+        for example in &examples {
             let (window, indicator) = (&example.window, example.indicator);
             example.push_state(&mut batch, Some((t.observation_noise, rng)));
             if c.n_image_steps > 0 {
                 for camera in 0..c.cameras.len() {
                     let corner = example.corner(c, (!centred).then_some(&mut *rng));
                     let frames = example.frames(c, camera)?;
-                    for &row in &window.observations[first_image..] {
-                        batch.push_part(camera, &frames.image(row)?, corner, data.crop(c), None);
-                    }
+                    let rows = window.observations[first_image..].iter();
+                    parts.extend(rows.map(|&row| Part { camera, frames, row, corner }));
                 }
             }
             for &row in &window.actions {
@@ -289,6 +290,7 @@ impl Trainer {
                 mask.extend(window.mask.iter().map(|&m| if m { 1.0f32 } else { 0.0 }));
             }
         }
+        batch.push_parts(&parts, data.crop(c))?;
         let mut noisy = Vec::with_capacity(rows * per);
         let mut target = Vec::with_capacity(rows * per);
         let mut timesteps = Vec::with_capacity(rows);

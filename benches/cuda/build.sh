@@ -2,7 +2,8 @@
 # Builds the tests of the networks and the examples peer, nut_assembly and evaluate with CUDA, on a machine with or without
 # GPU, driver and toolkit, into target/cuda/dist. benches/cuda/run.sh starts them on a machine with a GPU.
 #
-#   benches/cuda/build.sh [--check]        --check: only `cargo check`, links nothing
+#   benches/cuda/build.sh [--check]        --check: only clippy on the crate that has the kernels; links nothing.
+#                                          Status 3: nvcc could not be installed, and nothing was checked
 #
 #   CAPABILITY=90   compute capability times ten: 90 for H100 and H200 alone, 80 for these and all from A100 on
 #   JOBS=2
@@ -19,10 +20,12 @@ mkdir -p "$here/link" "$here/bin"
 
 if [ ! -x "$here/venv/bin/python" ] || ! ls "$here"/venv/lib/python3*/site-packages/nvidia/cu13/bin/nvcc >/dev/null 2>&1; then
     echo "installing nvcc into $here/venv" >&2
-    python3 -m venv "$here/venv"
-    "$here/venv/bin/pip" install --quiet --disable-pip-version-check --no-deps --only-binary :all: \
+    if ! { python3 -m venv "$here/venv" && "$here/venv/bin/pip" install --quiet --disable-pip-version-check --no-deps --only-binary :all: \
         nvidia-cuda-nvcc==13.0.88 nvidia-nvvm==13.0.88 nvidia-cuda-crt==13.0.88 \
-        nvidia-cuda-runtime==13.0.96 nvidia-cuda-cccl==13.0.85
+        nvidia-cuda-runtime==13.0.96 nvidia-cuda-cccl==13.0.85; }; then
+        echo "NOT RUN: nvcc could not be installed from Python wheels" >&2
+        exit 3
+    fi
 fi
 toolkit=$(echo "$here"/venv/lib/python3*/site-packages/nvidia/cu13)
 
@@ -63,12 +66,14 @@ export CUDARC_CUDA_VERSION=13000 CUDAFORGE_THREADS=$jobs CARGO_TARGET_DIR=$here/
 export RUSTFLAGS="${RUSTFLAGS:-} --cfg feature=\"dynamic-loading\""
 unset CUDA_PATH CUDA_ROOT CUDA_TOOLKIT_ROOT_DIR CUDNN_LIB
 common=(--release --locked --target "$triple" -j "$jobs")
+if [ "$check" = 1 ]; then
+    exec cargo clippy "${common[@]}" -p e2h-nn --all-targets --features e2h-nn/cuda -- -D warnings
+fi
 # The same packages for both, so that nothing below them is compiled twice.
 common+=(-p auto-e2h -p e2h-nn -p e2h-policy --features auto-e2h/cuda,e2h-nn/cuda,e2h-policy/cuda)
 examples=(--example peer --example nut_assembly --example evaluate)
 tests=(--test nn --test candle --test golden)
 
-if [ "$check" = 1 ]; then exec cargo check "${common[@]}" "${examples[@]}" "${tests[@]}"; fi
 cargo build "${common[@]}" "${examples[@]}"
 dist=$here/dist
 rm -rf "$dist"

@@ -506,7 +506,7 @@ extern "C" __global__ void squared_error(const float *a, const float *b, const f
     sum = block_sum(sum, 0).x;
     if (threadIdx.x == 0) *out = sum * scale;
 }
-// `d` is the gradient of the loss, `sign` 1 for the first and -1 for the second argument.
+// For the first argument; for the second the two change places. `d` is the gradient of the loss.
 extern "C" __global__ void squared_error_backward(const float *a, const float *b, const float *weights, const float *d,
                                                   float *da, size_t n, int width, float scale) {
     size_t i = index();

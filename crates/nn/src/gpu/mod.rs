@@ -228,6 +228,7 @@ impl Gpu {
                 "{name}: expected at most 2^32 blocks of numbers, found {blocks}; take a smaller batch"
             );
         };
+        debug_assert!(arguments.len() <= 16, "{name}: {} arguments", arguments.len());
         // Each in a word of its own: kernels read its first bytes, which is the low end here.
         let mut words = [0u64; 16];
         let mut pointers = [std::ptr::null_mut::<c_void>(); 16];

@@ -19,12 +19,12 @@ fn main() -> ExitCode {
     match command.status() {
         Ok(status) if status.success() => ExitCode::SUCCESS,
         Ok(status) => {
-            eprintln!("{nvcc} failed on {SOURCE}: {status}");
+            println!("cargo::error={nvcc} failed on {SOURCE}: {status}");
             ExitCode::FAILURE
         }
         Err(e) => {
-            eprintln!(
-                "feature `cuda`: expected NVIDIA's compiler as `{nvcc}`, which does not start ({e}); install the CUDA toolkit, \
+            println!(
+                "cargo::error=feature `cuda`: expected NVIDIA's compiler as `{nvcc}`, which does not start ({e}); install the CUDA toolkit, \
                  name the compiler in NVCC, or build with benches/cuda/build.sh"
             );
             ExitCode::FAILURE

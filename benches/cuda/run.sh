@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # On a machine with a GPU: the tests of the networks there, our speed beside PyTorch's, and a stage of the method at the paper's size.
 #
-#   benches/cuda/run.sh [test] [compare] [stage] [loop]       (without words: all of them, within ten minutes)
+#   benches/cuda/run.sh [test] [compare] [stage] [loop]       (without words: all of them)
 #
 #   DEVICE=cuda     or cuda:N
 #   ROUNDS=3        of compare, ours and PyTorch's in turn, the median of REPEATS=20 runs each

@@ -7,7 +7,7 @@ use crate::graph::network;
 use crate::numbers::Numbers;
 use crate::tape::{Node, Tape};
 use crate::{compute::Backend, grad};
-use candle_core::{DType, Tensor, TensorId};
+use candle_core::{DType, Shape, Tensor, TensorId};
 use std::sync::{Arc, Mutex};
 
 /// Turns the gradient of a result into those of its inputs and weights.
@@ -84,6 +84,7 @@ pub(crate) fn run(
     }
     let (count, steps) = tape.into_device_steps();
     let kept = Mutex::new(Some(steps));
+    let shapes: Vec<Shape> = arguments.iter().map(|a| a.shape().clone()).collect();
     let anchored = arguments.is_empty();
     if anchored {
         arguments.extend(weight.filter(|w| w.train).map(|w| &w.tensor));
@@ -102,8 +103,12 @@ pub(crate) fn run(
         }
         grad::give(flow.weights).map_err(candle_core::Error::wrap)?;
         let mut gradients = [None, None, None];
-        for (g, n) in gradients.iter_mut().zip(&tracked) {
-            *g = flow.grads[n.index()].take();
+        for ((g, n), input) in gradients.iter_mut().zip(&tracked).zip(&shapes) {
+            // Candle panics where what lies before an input gets no gradient.
+            *g = Some(match flow.grads[n.index()].take() {
+                Some(g) => g,
+                None => Tensor::zeros(input, DType::F32, dy.device())?,
+            });
         }
         Ok(gradients)
     };

@@ -65,7 +65,7 @@ impl Way {
             (true, true, false) => "over_bf16_1",
             (true, true, true) => "over_bf16_4",
         };
-        let y = if self.bf16 { gpu.new_bf16((rows, wide))? } else { gpu.new((rows, wide))? };
+        let y = if self.bf16 { gpu.empty_bf16((rows, wide))? } else { gpu.empty((rows, wide))? };
         let per = (GATHERED / (if four { wide / 4 } else { wide })).max(1);
         let sizes = [Arg::I(c), Arg::I(self.to_rows), Arg::I(self.from_rows), Arg::I(rows), Arg::I(per)];
         let arguments = [Arg::T(x), Arg::T(&y), Arg::G(&self.sizes)].into_iter().chain(sizes);
@@ -90,7 +90,7 @@ impl Way {
             (true, true, false) => "collect_over_bf16_1",
             (true, true, true) => "collect_over_bf16_4",
         };
-        let dx = gpu.new(shape)?;
+        let dx = gpu.empty(shape)?;
         let per = (GATHERED / 4 / (if four { c / 4 } else { c })).max(1);
         let sizes = [Arg::I(c), Arg::I(self.to_rows), Arg::I(self.from_rows), Arg::I(rows), Arg::I(per)];
         let arguments = [Arg::T(&d), Arg::T(&dx), Arg::G(&self.sizes)].into_iter().chain(sizes);
@@ -113,7 +113,7 @@ pub(crate) fn convolution(
     let gpu = Gpu::of(&xt)?;
     let columns = way.columns(&gpu, &xt)?;
     let w = way.factor(&gpu, &weight.tensor.detach())?;
-    let y = gpu.new(shape)?;
+    let y = gpu.empty(shape)?;
     let (m, k, n) = (way.rows(), way.taps * way.from, way.to);
     gpu.product((&columns, &w, &y), (m, k, n), (false, false))?;
     if let Some(bias) = bias {
@@ -129,7 +129,7 @@ pub(crate) fn convolution(
         let d = way.factor(&gpu, dy)?;
         if weight.train {
             let columns = kept.map_or_else(|| way.columns(&gpu, &xt), Ok)?;
-            let dw = gpu.new(weight.tensor.shape())?;
+            let dw = gpu.empty(weight.tensor.shape())?;
             gpu.product((&columns, &d, &dw), (k, m, n), (true, false))?;
             flow.weight(&weight, dw);
         }
@@ -140,7 +140,7 @@ pub(crate) fn convolution(
         if wanted {
             // What is summed again may be rounded first; what leaves is f32.
             let rounded = way.bf16 && !way.itself;
-            let dc = if rounded { gpu.new_bf16((m, k))? } else { gpu.new((m, k))? };
+            let dc = if rounded { gpu.empty_bf16((m, k))? } else { gpu.empty((m, k))? };
             gpu.product((&d, &w, &dc), (m, n, k), (false, true))?;
             flow.add(x, way.collected(&gpu, dc, xt.dims())?)?;
         }
@@ -160,7 +160,7 @@ pub(crate) fn group_norm(
     let (xt, extra) = (tape.tensor(x)?.clone(), other.map(|o| tape.tensor(o).cloned()).transpose()?);
     let gpu = Gpu::of(&xt)?;
     let Dims { b, s, c, groups } = *dims;
-    let (y, stats) = (gpu.new(xt.shape())?, gpu.new((b, groups, 2))?);
+    let (y, stats) = (gpu.empty(xt.shape())?, gpu.empty((b, groups, 2))?);
     // Four numbers a thread, in whole warps, and no fewer than a row of the group.
     let threads = (s * (c / groups) / 4).max(c / groups).next_power_of_two().clamp(32, 1024) as u32;
     let code = match post {
@@ -182,11 +182,11 @@ pub(crate) fn group_norm(
     let something = wanted || other.is_some() || gain.train;
     Ok(tape.push_device(y, something, move |dy, flow| {
         let gpu = flow.gpu.clone();
-        let sums = gpu.new((b, 2 * c))?;
-        let dx = wanted.then(|| gpu.new(xt.shape())).transpose()?;
+        let sums = gpu.empty((b, 2 * c))?;
+        let dx = wanted.then(|| gpu.empty(xt.shape())).transpose()?;
         // What is added after the activation has the gradient of the result.
         let apart = extra.as_ref().filter(|_| other.is_some() && post != Post::MishAdd);
-        let d_extra = apart.map(|e| gpu.new(e.shape())).transpose()?;
+        let d_extra = apart.map(|e| gpu.empty(e.shape())).transpose()?;
         let arguments = [
             Arg::T(&xt),
             Arg::T(&yt),
@@ -226,11 +226,11 @@ fn elementwise(
 ) -> Result<Node> {
     let xt = tape.tensor(x)?.clone();
     let gpu = Gpu::of(&xt)?;
-    let (y, n) = (gpu.new(xt.shape())?, xt.elem_count());
+    let (y, n) = (gpu.empty(xt.shape())?, xt.elem_count());
     gpu.each(forward, n, &[Arg::T(&xt), Arg::T(&y), Arg::N(n)])?;
     let (wanted, read) = (tape.grad(x), if of_result { y.clone() } else { xt });
     Ok(tape.push_device(y, wanted, move |dy, flow| {
-        let dx = flow.gpu.new(read.shape())?;
+        let dx = flow.gpu.empty(read.shape())?;
         flow.gpu.each(backward, n, &[Arg::T(&read), Arg::T(dy), Arg::T(&dx), Arg::N(n)])?;
         flow.add(x, dx)
     }))
@@ -259,7 +259,7 @@ pub(crate) fn masked(tape: &mut Tape, x: Node, mask: Vec<f32>) -> Result<Node> {
     let xt = tape.tensor(x)?;
     let (gpu, mask) = (Gpu::of(xt)?, Tensor::from_vec(mask, xt.shape(), xt.device())?);
     let product = move |gpu: &Gpu, x: &Tensor, mask: &Tensor| -> Result<Tensor> {
-        let (y, n) = (gpu.new(x.shape())?, x.elem_count());
+        let (y, n) = (gpu.empty(x.shape())?, x.elem_count());
         gpu.each("multiply", n, &[Arg::T(x), Arg::T(mask), Arg::T(&y), Arg::N(n)])?;
         Ok(y)
     };
@@ -274,7 +274,7 @@ pub(crate) fn masked(tape: &mut Tape, x: Node, mask: Vec<f32>) -> Result<Node> {
 pub(crate) fn film(tape: &mut Tape, x: Node, e: Node, steps: usize, c: usize) -> Result<Node> {
     let (xt, et) = (tape.tensor(x)?.clone(), tape.tensor(e)?.clone());
     let gpu = Gpu::of(&xt)?;
-    let (y, n) = (gpu.new(xt.shape())?, xt.elem_count());
+    let (y, n) = (gpu.empty(xt.shape())?, xt.elem_count());
     gpu.each(
         "film_forward",
         n,
@@ -282,7 +282,7 @@ pub(crate) fn film(tape: &mut Tape, x: Node, e: Node, steps: usize, c: usize) ->
     )?;
     let wanted = [x, e].map(|n| tape.grad(n));
     Ok(tape.push_device(y, wanted != [false, false], move |dy, flow| {
-        let (dx, de, n) = (flow.gpu.new(xt.shape())?, flow.gpu.new(et.shape())?, n / steps);
+        let (dx, de, n) = (flow.gpu.empty(xt.shape())?, flow.gpu.empty(et.shape())?, n / steps);
         let tensors = [Arg::T(&xt), Arg::T(&et), Arg::T(dy), Arg::T(&dx), Arg::T(&de)];
         let sizes = [Arg::N(n), Arg::I(steps), Arg::I(c)];
         flow.gpu.each("film_backward", n, &tensors.into_iter().chain(sizes).collect::<Vec<_>>())?;
@@ -306,7 +306,7 @@ pub(crate) fn concat(tape: &mut Tape, parts: &[(Node, usize)], shape: &[usize]) 
         let gpu = Gpu::of(x)?;
         let y = match &y {
             Some(y) => y,
-            None => y.insert(gpu.new(shape)?),
+            None => y.insert(gpu.empty(shape)?),
         };
         let n = x.elem_count();
         gpu.each("join", n, &[Arg::T(x), Arg::T(y), Arg::N(n), Arg::I(*w), Arg::I(width), Arg::I(at)])?;
@@ -319,7 +319,7 @@ pub(crate) fn concat(tape: &mut Tape, parts: &[(Node, usize)], shape: &[usize]) 
     Ok(tape.push_device(y, !back.is_empty(), move |dy, flow| {
         for (node, shape, w, at) in back {
             let n = shape.elem_count();
-            let dx = flow.gpu.new(shape)?;
+            let dx = flow.gpu.empty(shape)?;
             flow.gpu.each(
                 "split",
                 n,
@@ -335,11 +335,11 @@ pub(crate) fn repeat_rows(tape: &mut Tape, x: Node, times: usize) -> Result<Node
     let xt = tape.tensor(x)?.clone();
     let (b, w) = xt.dims2()?;
     let gpu = Gpu::of(&xt)?;
-    let (y, n) = (gpu.new((b * times, w))?, b * times * w);
+    let (y, n) = (gpu.empty((b * times, w))?, b * times * w);
     gpu.each("repeat_forward", n, &[Arg::T(&xt), Arg::T(&y), Arg::N(n), Arg::I(times), Arg::I(w)])?;
     let wanted = tape.grad(x);
     Ok(tape.push_device(y, wanted, move |dy, flow| {
-        let dx = flow.gpu.new((b, w))?;
+        let dx = flow.gpu.empty((b, w))?;
         flow.gpu.each(
             "repeat_backward",
             b * w,
@@ -355,11 +355,11 @@ pub(crate) fn max_pool(tape: &mut Tape, x: Node, m: &Map) -> Result<Node> {
     let p = m.pooled();
     let g = Geo { b: m.b, h: m.h, w: m.w, c: m.c, n: m.c, kh: 3, kw: 3, sh: 2, sw: 2, ph: 1, pw: 1 };
     let (sizes, n) = (Sizes::new(&g), p.b * p.h * p.w * p.c);
-    let y = gpu.new((p.b, p.h, p.w, p.c))?;
+    let y = gpu.empty((p.b, p.h, p.w, p.c))?;
     gpu.each("max_forward", n, &[Arg::T(&xt), Arg::T(&y), Arg::G(&sizes), Arg::N(n)])?;
     let (wanted, yt) = (tape.grad(x), y.clone());
     Ok(tape.push_device(y, wanted, move |dy, flow| {
-        let (dx, n) = (flow.gpu.new(xt.shape())?, xt.elem_count());
+        let (dx, n) = (flow.gpu.empty(xt.shape())?, xt.elem_count());
         let arguments = [Arg::T(&xt), Arg::T(&yt), Arg::T(dy), Arg::T(&dx), Arg::G(&sizes), Arg::N(n)];
         flow.gpu.each("max_backward", n, &arguments)?;
         flow.add(x, dx)
@@ -371,7 +371,7 @@ pub(crate) fn keypoints(tape: &mut Tape, logits: Node, m: &Map) -> Result<Node> 
     let xt = tape.tensor(logits)?.clone();
     let gpu = Gpu::of(&xt)?;
     let (h, w, c, pairs) = (m.h, m.w, m.c, m.b * m.c);
-    let (attention, y) = (gpu.new(xt.shape())?, gpu.new((m.b, 2 * c))?);
+    let (attention, y) = (gpu.empty(xt.shape())?, gpu.empty((m.b, 2 * c))?);
     let sizes = move || [Arg::I(h), Arg::I(w), Arg::I(c)].into_iter();
     let tensors = [Arg::T(&xt), Arg::T(&attention), Arg::T(&y)];
     gpu.each(
@@ -381,7 +381,7 @@ pub(crate) fn keypoints(tape: &mut Tape, logits: Node, m: &Map) -> Result<Node> 
     )?;
     let (wanted, yt) = (tape.grad(logits), y.clone());
     Ok(tape.push_device(y, wanted, move |dy, flow| {
-        let (dx, n) = (flow.gpu.new(attention.shape())?, attention.elem_count());
+        let (dx, n) = (flow.gpu.empty(attention.shape())?, attention.elem_count());
         let tensors = [Arg::T(&attention), Arg::T(&yt), Arg::T(dy), Arg::T(&dx)];
         let all: Vec<_> = tensors.into_iter().chain(sizes()).chain([Arg::N(n)]).collect();
         flow.gpu.each("keypoints_backward", n, &all)?;
@@ -401,7 +401,7 @@ pub(crate) fn squared_error(
     let gpu = Gpu::of(&at)?;
     let given = !weights.is_empty();
     let weights = given.then(|| Tensor::from_slice(weights, weights.len(), at.device())).transpose()?;
-    let (y, n) = (gpu.new(())?, at.elem_count());
+    let (y, n) = (gpu.empty(())?, at.elem_count());
     let tensors = [Arg::T(&at), Arg::T(&bt), Arg::Maybe(weights.as_ref()), Arg::T(&y)];
     let sizes = [Arg::N(n), Arg::I(width), Arg::F(scale)];
     let all: Vec<_> = tensors.into_iter().chain(sizes).collect();
@@ -410,7 +410,7 @@ pub(crate) fn squared_error(
     Ok(tape.push_device(y, wanted != [false, false], move |dy, flow| {
         let pairs = [(a, &at, &bt), (b, &bt, &at)];
         for ((node, x, y), _) in pairs.into_iter().zip(wanted).filter(|(_, w)| *w) {
-            let dx = flow.gpu.new(x.shape())?;
+            let dx = flow.gpu.empty(x.shape())?;
             let tensors = [Arg::T(x), Arg::T(y), Arg::Maybe(weights.as_ref()), Arg::T(dy), Arg::T(&dx)];
             let sizes = [Arg::N(n), Arg::I(width), Arg::F(scale)];
             let all: Vec<_> = tensors.into_iter().chain(sizes).collect();

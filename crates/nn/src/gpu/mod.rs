@@ -176,7 +176,7 @@ impl Gpu {
     }
 
     /// Memory whose numbers the next kernel sets.
-    pub(crate) fn new(&self, shape: impl Into<Shape>) -> candle_core::Result<Tensor> {
+    pub(crate) fn empty(&self, shape: impl Into<Shape>) -> candle_core::Result<Tensor> {
         let shape = shape.into();
         // SAFETY: every caller gives it to a kernel or a product that writes all of it before anything reads it.
         let slice = unsafe { self.device.alloc::<f32>(shape.elem_count())? };
@@ -185,7 +185,7 @@ impl Gpu {
     }
 
     /// The same in bf16.
-    pub(crate) fn new_bf16(&self, shape: impl Into<Shape>) -> candle_core::Result<Tensor> {
+    pub(crate) fn empty_bf16(&self, shape: impl Into<Shape>) -> candle_core::Result<Tensor> {
         let shape = shape.into();
         // SAFETY: as above.
         let slice = unsafe { self.device.alloc::<bf16>(shape.elem_count())? };
@@ -277,14 +277,14 @@ impl Gpu {
 
     /// `x` in bf16.
     pub(crate) fn bf16(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let y = self.new_bf16(x.shape())?;
+        let y = self.empty_bf16(x.shape())?;
         self.each("to_bf16", x.elem_count(), &[Arg::T(x), Arg::T(&y), Arg::N(x.elem_count())])?;
         Ok(y)
     }
 
     /// The sums of the columns of rows of `n`.
     pub(crate) fn column_sums(&self, x: &Tensor, n: usize) -> candle_core::Result<Tensor> {
-        let (y, rows) = (self.new(n)?, x.elem_count() / n.max(1));
+        let (y, rows) = (self.empty(n)?, x.elem_count() / n.max(1));
         self.launch(
             "column_sums",
             n.div_ceil(32),
@@ -296,7 +296,7 @@ impl Gpu {
     }
 
     pub(crate) fn add(&self, a: &Tensor, b: &Tensor) -> candle_core::Result<Tensor> {
-        let y = self.new(a.shape())?;
+        let y = self.empty(a.shape())?;
         self.each("add", a.elem_count(), &[Arg::T(a), Arg::T(b), Arg::T(&y), Arg::N(a.elem_count())])?;
         Ok(y)
     }

@@ -40,7 +40,7 @@ impl Gpu {
     pub(crate) fn norm(&self, gradients: &[&Tensor]) -> Result<Tensor> {
         let rows: Vec<[&Tensor; 1]> = gradients.iter().map(|g| [*g]).collect();
         let table = self.table(&rows)?;
-        let (parts, norm) = (self.new(table.blocks)?, self.new(())?);
+        let (parts, norm) = (self.empty(table.blocks)?, self.empty(())?);
         let arguments = [Arg::Words(&table.words), Arg::I(table.count), Arg::T(&parts)];
         self.launch("squares", table.blocks, THREADS, 0, &arguments)?;
         self.launch("root", 1, THREADS, 0, &[Arg::T(&parts), Arg::T(&norm), Arg::I(table.blocks)])?;

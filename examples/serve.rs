@@ -10,7 +10,8 @@
 
 use auto_e2h::core::{Failure, mention, say};
 use auto_e2h::learn::{Error, Stop, hub};
-use auto_e2h::serve::{Inputs, Server, Settings, Token, open};
+use auto_e2h::nn::{Compute, Precision};
+use auto_e2h::serve::{Inputs, Server, Settings, Token, open_on};
 use clap::Parser;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -51,6 +52,9 @@ struct Arguments {
     /// Seed of the clients that send none.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Where the policy is computed: cpu, cuda or cuda:N.
+    #[arg(long, default_value = "cpu")]
+    device: String,
     /// Threads of the network (by default one per core); never changes an answer.
     #[arg(long)]
     threads: Option<usize>,
@@ -88,7 +92,8 @@ fn program() -> anyhow::Result<i32> {
         seed: a.seed,
     };
     let stop = Stop::on_signals()?;
-    let policy = open(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?)?;
+    let compute = Compute::open(&a.device, Precision::default())?;
+    let policy = open_on(&hub::resolve(&a.checkpoint, &hub::Settings::from_env())?, &compute)?;
     let server = Server::start(policy, settings)?;
     say(format_args!("ws://{}: {}", server.address(), words(server.inputs())))?;
     loop {

@@ -96,5 +96,6 @@ fn a_server_wants_its_token_and_no_strangers() {
     };
     refuse(&["--checkpoint", CHECKPOINT, "--listen", "0.0.0.0:0"], &["0.0.0.0:0", "loopback", "token"]);
     refuse(&["--checkpoint", CHECKPOINT, "--token-file", "no/such"], &["no/such"]);
+    refuse(&["--checkpoint", CHECKPOINT, "--device", "gpu"], &["`gpu`", "cpu, cuda or cuda:N"]);
     refuse(&["--checkpoint", "no/such"], &["no/such", "policy.json"]);
 }

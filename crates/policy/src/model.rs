@@ -124,6 +124,25 @@ impl DiffusionModel {
         Ok(this)
     }
 
+    /// The same network on another device, for inference.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub(crate) fn into_device(
+        self,
+        compute: &Compute,
+        config: &PolicyConfig,
+        widths: Widths,
+    ) -> Result<Self> {
+        if self.params.is_on(compute) {
+            return Ok(self);
+        }
+        let mut rng = e2h_core::stream(0, "weights", 0, 0);
+        let this = Self::of_widths(compute, config, widths, Mode::Infer, &mut rng)?;
+        this.params.import(&self.params.export()?)?;
+        Ok(this)
+    }
+
     pub(crate) fn parts(
         config: &PolicyConfig,
         widths: Widths,

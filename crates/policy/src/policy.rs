@@ -45,12 +45,8 @@ impl DiffusionPolicy {
     /// # Errors
     /// When the device fails.
     pub fn into_device(self, compute: &Compute) -> Result<Self> {
-        if self.model.params.is_on(compute) {
-            return Ok(self);
-        }
-        let model =
-            DiffusionModel::new_on(compute, &self.config, Mode::Infer, &mut stream(0, "weights", 0, 0))?;
-        model.params.import(&self.model.params.export()?)?;
+        let widths = Widths { state: self.config.state_features(), action: ACTION_DIM };
+        let model = self.model.into_device(compute, &self.config, widths)?;
         Ok(Self { model, ..self })
     }
 

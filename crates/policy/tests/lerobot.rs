@@ -4,7 +4,9 @@
 #![allow(clippy::print_stdout, reason = "how far both are is worth reading when it fails")]
 
 use e2h_core::Image;
-use e2h_nn::{HostTensor, SpatialSoftmax, Weights, load_weights, save_weights};
+use e2h_nn::{
+    Compute, HostTensor, Precision, SpatialSoftmax, Weights, candle_operations, load_weights, save_weights,
+};
 use e2h_policy::lerobot::{LerobotObservation, LerobotPolicy, import};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -66,6 +68,21 @@ fn a_low_dimensional_policy_of_lerobots_acts_the_same_with_its_own_sampler() {
         policy.sample(&[seen.iter().collect()], &mut |x| x.copy_from_slice(&numbers(k, x.len()))).unwrap()
     };
     assert_ne!(act(1), act(2));
+}
+
+/// On Candle's operations, or on the GPU that `E2H_TEST_DEVICE` names.
+#[test]
+fn a_policy_of_lerobots_acts_the_same_on_another_device() {
+    let folder = golden("state");
+    let policy = import(&folder).unwrap();
+    let moved = || {
+        let name = std::env::var("E2H_TEST_DEVICE");
+        let compute = Compute::open(name.as_deref().unwrap_or("cpu"), Precision::default()).unwrap();
+        let policy = policy.into_device(&compute).unwrap();
+        difference(&policy, &folder.join("expected.safetensors"))
+    };
+    let worst = if std::env::var("E2H_TEST_DEVICE").is_ok() { moved() } else { candle_operations(moved) };
+    assert!(worst < 1e-4, "{worst:e}");
 }
 
 /// `config.json` may describe a network of any size, and so may a checkpoint of ours: it is refused by what the weights are,

@@ -50,6 +50,6 @@ pub use client::{Client, ClientSettings};
 pub use error::{Error, Result};
 pub use remote::{Metadata, RemotePolicy, RemoteSettings};
 pub use request::Request;
-pub use servable::{Camera, Inputs, Seen, Servable, open};
+pub use servable::{Camera, Inputs, Seen, Servable, open, open_on};
 pub use server::{Server, Settings};
 pub use token::Token;

@@ -4,6 +4,7 @@ use crate::wire::Value;
 use crate::{Error, Result};
 use e2h_core::{ACTION_DIM, Action, CONTROL_HZ, Image, Observation, Rng, STATE_DIM};
 use e2h_data::lerobot::{ACTION_NAMES, STATE_NAMES};
+use e2h_nn::Compute;
 use e2h_policy::lerobot::{LerobotObservation, LerobotPolicy};
 use e2h_policy::{DiffusionPolicy, Provenance};
 use rand::Rng as _;
@@ -220,9 +221,17 @@ impl<P: Servable> Servable for Known<P> {
 /// # Errors
 /// When a file is missing, foreign or does not match; names what was expected and found.
 pub fn open(folder: &Path) -> Result<Box<dyn Servable>> {
+    open_on(folder, &Compute::cpu())
+}
+
+/// The same, with its network on a device.
+///
+/// # Errors
+/// As [`open`], and when the device fails.
+pub fn open_on(folder: &Path, compute: &Compute) -> Result<Box<dyn Servable>> {
     if folder.join("config.json").exists() && !folder.join("policy.json").exists() {
-        return Ok(Box::new(e2h_policy::lerobot::import(folder)?));
+        return Ok(Box::new(e2h_policy::lerobot::import(folder)?.into_device(compute)?));
     }
     let (policy, checkpoint) = DiffusionPolicy::load(folder)?;
-    Ok(Box::new(Known(policy, checkpoint.provenance)))
+    Ok(Box::new(Known(policy.into_device(compute)?, checkpoint.provenance)))
 }

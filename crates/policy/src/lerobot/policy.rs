@@ -3,12 +3,13 @@
 use super::description::Obstacle;
 use super::scaling::Scaling;
 use super::{IMAGES, STATE};
-use crate::model::DiffusionModel;
+use crate::model::{DiffusionModel, Widths};
 use crate::policy::denoise;
 use crate::{Ddim, DiffusionPolicy, Error, ImageScaling, PolicyConfig, Provenance, Result};
-use candle_core::{Device, Tensor};
+use candle_core::Tensor;
 use e2h_core::{ACTION_DIM, Image, STATE_DIM};
 use e2h_data::Normaliser;
+use e2h_nn::Compute;
 use std::path::PathBuf;
 
 /// What a LeRobot policy sees at one step, in the units of its dataset.
@@ -42,6 +43,16 @@ pub struct LerobotPolicy {
 }
 
 impl LerobotPolicy {
+    /// The same policy on another device.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn into_device(self, compute: &Compute) -> Result<Self> {
+        let widths = Widths { state: self.state.0 + self.environment.0, action: self.action.0 };
+        let model = self.model.into_device(compute, &self.config, widths)?;
+        Ok(Self { model, ..self })
+    }
+
     /// Numbers of `observation.state`.
     #[must_use]
     pub fn state_dim(&self) -> usize {
@@ -153,13 +164,13 @@ impl LerobotPolicy {
                 self.push_crop(image, scaling, pixels);
             }
         }
-        let b = histories.len();
+        let (b, device) = (histories.len(), self.model.device());
         let width = state.len() / b;
-        let state = Tensor::from_vec(state, (b, width), &Device::Cpu)?;
+        let state = Tensor::from_vec(state, (b, width), device)?;
         let [rows, columns] = self.crop;
         let images = images
             .into_iter()
-            .map(|v| Tensor::from_vec(v, (b * c.n_obs_steps, rows, columns, 3), &Device::Cpu))
+            .map(|v| Tensor::from_vec(v, (b * c.n_obs_steps, rows, columns, 3), device))
             .collect::<candle_core::Result<Vec<_>>>()?;
         let condition = self.model.condition(&state, &images)?;
         let mut x = denoise(&self.model, &self.ddim, c, self.action.0, &condition, noise)?;

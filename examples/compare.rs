@@ -13,6 +13,7 @@ use anyhow::{Context as _, bail, ensure};
 use auto_e2h::core::{Direction, mention, say};
 use auto_e2h::data::{read_text, write_atomic};
 use auto_e2h::learn::{Error, Progress, Published, Run, RunOptions, Stop, evaluate};
+use auto_e2h::nn::{Compute, Precision};
 use auto_e2h::report::compare::{self, ComparedRun, Comparison};
 use auto_e2h::report::record::Evaluation;
 use clap::Parser;
@@ -66,6 +67,9 @@ struct Arguments {
     /// Only write the page of the runs that are there.
     #[arg(long)]
     merge: bool,
+    /// Where networks are trained: cpu, cuda or cuda:N. A folder may go on elsewhere; results may then differ in the last bits.
+    #[arg(long, default_value = "cpu")]
+    device: String,
     /// Do one run alone, in this process.
     #[arg(long, value_name = "TASK/METHOD/SEED", conflicts_with_all = ["merge", "shard"])]
     only: Option<String>,
@@ -107,6 +111,7 @@ impl Job {
             seed: self.seed,
             set: a.set.clone(),
             quiet: a.quiet,
+            device: a.device.clone(),
             threads: a.threads,
             ..RunOptions::new(&self.task)
         }
@@ -166,6 +171,7 @@ fn check(a: &Arguments) -> anyhow::Result<Vec<Job>> {
         );
     }
     ensure!(a.jobs != Some(0), "--jobs: expected at least 1, got 0");
+    Compute::open(&a.device, Precision::default())?;
     let mut jobs = vec![];
     for method in &a.methods {
         for task in &a.tasks {
@@ -387,7 +393,14 @@ fn start(a: &Arguments, job: &Job, threads: usize) -> anyhow::Result<Child> {
     command.args(["--only", &job.name(), "--preset", &a.preset, "--threads", &threads.to_string()]);
     command.args(["--tasks", &a.tasks.join(","), "--methods", &a.methods.join(",")]);
     command.args(["--seeds", &a.seeds.iter().map(u64::to_string).collect::<Vec<_>>().join(",")]);
-    command.args(["--trials", &a.trials.to_string(), "--evaluation-seed", &a.evaluation_seed.to_string()]);
+    command.args([
+        "--device",
+        &a.device,
+        "--trials",
+        &a.trials.to_string(),
+        "--evaluation-seed",
+        &a.evaluation_seed.to_string(),
+    ]);
     command.arg("--out").arg(&a.out);
     for set in &a.set {
         command.args(["--set", set]);

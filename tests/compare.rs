@@ -139,6 +139,7 @@ fn what_cannot_run_is_said_before_any_work() {
     refused(&["--tasks", "disk", "--set", "loop.cycels=3"], "loop.cycles");
     refused(&["--tasks", "disk,disk"], "named twice");
     refused(&["--tasks", "disk", "--trials", "0"], "--trials");
+    refused(&["--tasks", "disk", "--device", "gpu"], "cpu, cuda or cuda:N");
     refused(&["--tasks", "disk", "--merge"], "no plan.json");
     // Somebody else's folder stays as it is.
     std::fs::write(dir.path().join("mine.txt"), "x").unwrap();

@@ -20,6 +20,8 @@ const SPEED: f64 = 250.0;
 const JAW_SPEED: f64 = 250.0;
 /// Width of the plug, mm.
 const PLUG: f64 = 18.0;
+/// How far from the middle of the jaws the plug may be to be grasped, mm.
+const REACH: f64 = 12.0;
 /// Play round the plug in the socket, mm to each side; beyond it the plug stands on the socket's rim.
 const PLAY: f64 = 5.0;
 /// Half the side of the socket's block and its height, mm.
@@ -31,8 +33,8 @@ pub(crate) struct Robot {
     pub(crate) hand: [f64; 3],
     pub(crate) jaw: f64,
     pub(crate) plug: [f64; 3],
-    /// From the hand to the plug that it holds.
-    held: Option<[f64; 3]>,
+    /// How far below the hand the plug is that it holds.
+    held: Option<f64>,
 }
 
 impl Robot {
@@ -65,20 +67,19 @@ impl Robot {
         let offset: [f64; 3] = std::array::from_fn(|i| self.plug[i] - self.hand[i]);
         if self.jaw > PLUG + 2.0 {
             self.held = None;
-        } else if self.held.is_none() && offset[0].hypot(offset[1]) < 12.0 && offset[2].abs() < 25.0 {
-            self.held = Some(offset);
+        } else if self.held.is_none() && offset[0].hypot(offset[1]) < REACH && offset[2].abs() < 25.0 {
+            self.held = Some(offset[2]);
         }
-        if let Some(offset) = self.held {
+        if let Some(below) = self.held {
             // It cannot close further than the plug is wide.
             self.jaw = self.jaw.max(PLUG);
-            let wanted: [f64; 3] = std::array::from_fn(|i| self.hand[i] + offset[i]);
-            if self.in_hole() && self.plug[2] < BLOCK.1 {
-                // The socket's walls hold it until it is out.
-                self.plug[2] = wanted[2].max(0.0);
-            } else {
-                self.plug = wanted;
-                self.plug[2] = self.plug[2].max(self.floor());
+            let down = self.in_hole() && self.plug[2] < BLOCK.1;
+            for (i, socket) in SOCKET.into_iter().enumerate() {
+                // Jaws with a notch for round plugs bring it to their middle. The socket's walls hold it until it is out.
+                let free = if down { PLAY } else { f64::INFINITY };
+                self.plug[i] = self.hand[i].clamp(socket - free, socket + free);
             }
+            self.plug[2] = (self.hand[2] + below).max(if down { 0.0 } else { self.floor() });
         } else {
             self.plug[2] = (self.plug[2] - 20.0).max(self.floor());
         }

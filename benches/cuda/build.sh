@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the tests of the networks and the examples peer, nut_assembly and evaluate with CUDA, on a machine with or without
+# Builds the tests of the networks and the examples peer, nut_assembly, compare and evaluate with CUDA, on a machine with or without
 # GPU, driver and toolkit, into target/cuda/dist. benches/cuda/run.sh starts them on a machine with a GPU.
 #
 #   benches/cuda/build.sh [--check]        --check: only clippy on the crate that has the kernels; links nothing.
@@ -71,10 +71,10 @@ if [ "$check" = 1 ]; then
 fi
 # The same packages for both, so that nothing below them is compiled twice.
 common+=(-p auto-e2h -p e2h-nn -p e2h-policy --features auto-e2h/cuda,e2h-nn/cuda,e2h-policy/cuda)
-examples=(--example peer --example nut_assembly --example evaluate)
+programs=(peer nut_assembly compare evaluate)
 tests=(--test nn --test candle --test golden)
 
-cargo build "${common[@]}" "${examples[@]}"
+cargo build "${common[@]}" "${programs[@]/#/--example=}"
 dist=$here/dist
 rm -rf "$dist"
 mkdir -p "$dist"
@@ -87,10 +87,10 @@ for line in sys.stdin:
         print(made["package_id"].split("/")[-1].split("#")[0], made["target"]["name"], made["executable"])' |
     while read -r package name file; do cp "$file" "$dist/test.$package.$name"; done
 built=$here/build/$triple/release
-cp "$built/examples/peer" "$built/examples/nut_assembly" "$built/examples/evaluate" "$dist"
+cp "${programs[@]/#/$built/examples/}" "$dist"
 cp "$(find "$built/build" -name 'libmujoco.so.*' -size +1M | head -1)" "$dist"
-strip "$dist"/test.* "$dist"/peer "$dist"/nut_assembly "$dist"/evaluate
-for program in "$dist"/test.* "$dist"/peer "$dist"/nut_assembly "$dist"/evaluate; do
+strip "$dist"/test.* "${programs[@]/#/$dist/}"
+for program in "$dist"/test.* "${programs[@]/#/$dist/}"; do
     if readelf -d "$program" | grep -E 'NEEDED.*lib(cu|nv)'; then
         echo "$program still needs a CUDA library to start" >&2
         exit 1

@@ -277,8 +277,8 @@ impl Gpu {
 
     /// `x` in bf16.
     pub(crate) fn bf16(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let y = self.empty_bf16(x.shape())?;
-        self.each("to_bf16", x.elem_count(), &[Arg::T(x), Arg::T(&y), Arg::N(x.elem_count())])?;
+        let (y, n) = (self.empty_bf16(x.shape())?, x.elem_count());
+        self.each("to_bf16", n.div_ceil(4), &[Arg::T(x), Arg::T(&y), Arg::N(n)])?;
         Ok(y)
     }
 

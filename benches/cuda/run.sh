@@ -8,8 +8,8 @@
 #   PYTHON=python3  for compare: one with torch and lerobot 0.4.4; where it has not, they are installed below target/peers
 #
 # Starts what benches/cuda/build.sh left in target/cuda/dist. Needs NVIDIA's driver (580 or newer) and cuBLAS and cuRAND 13: a
-# toolkit's, those beside torch in PYTHON, or else as Python packages below target/cuda/run (about 600 MB). cuDNN 9 is used where
-# it lies beside them; E2H_CONVOLUTION=gather does without it, E2H_CONVOLUTION=cudnn asks for it wherever it can.
+# toolkit's, those beside torch in PYTHON, or else as Python packages below target/cuda/run (about 600 MB). cuDNN 9 is found
+# where it lies beside them; E2H_CONVOLUTION=large uses it for large convolutions, E2H_CONVOLUTION=cudnn wherever it can.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 root=$PWD dist=$PWD/target/cuda/dist venv=$PWD/target/cuda/run device=${DEVICE:-cuda} python=${PYTHON:-python3}

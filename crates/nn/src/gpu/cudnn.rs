@@ -86,7 +86,7 @@ functions! {
 fn check(call: &str, status: c_int) -> candle_core::Result<()> {
     if status != 0 {
         candle_core::bail!(
-            "{call}: expected status 0 of cuDNN, found {status}; {VARIABLE}=gather does without it"
+            "{call}: expected status 0 of cuDNN, found {status}; without {VARIABLE} it is not asked"
         );
     }
     Ok(())
@@ -95,9 +95,9 @@ fn check(call: &str, status: c_int) -> candle_core::Result<()> {
 /// Who computes convolutions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Choice {
-    /// cuDNN where it pays and can be loaded.
-    Best,
     Gather,
+    /// cuDNN where it should pay and can be loaded.
+    Large,
     /// cuDNN whatever the sizes, for comparisons.
     Cudnn,
 }
@@ -106,10 +106,11 @@ impl Choice {
     /// What the environment asks for.
     pub(crate) fn asked() -> candle_core::Result<Self> {
         match std::env::var(VARIABLE).as_deref() {
-            Err(_) | Ok("") => Ok(Self::Best),
-            Ok("gather") => Ok(Self::Gather),
+            // The default until cuDNN has been measured beside it.
+            Err(_) | Ok("" | "gather") => Ok(Self::Gather),
+            Ok("large") => Ok(Self::Large),
             Ok("cudnn") => Ok(Self::Cudnn),
-            Ok(found) => candle_core::bail!("{VARIABLE}: expected gather or cudnn, found {found}"),
+            Ok(found) => candle_core::bail!("{VARIABLE}: expected gather, large or cudnn, found {found}"),
         }
     }
 }
@@ -286,7 +287,7 @@ pub(super) fn plan(gpu: &Gpu, g: &Geo, x: &Tensor, bf16: bool) -> candle_core::R
     let columns = rows * taps * g.c * if bf16 { 2 } else { 4 };
     let asked = match gpu.choice {
         Choice::Gather => false,
-        Choice::Best => (bf16 || tf32) && columns > KEPT && rows >= ROWS * g.n,
+        Choice::Large => (bf16 || tf32) && columns > KEPT && rows >= ROWS * g.n,
         Choice::Cudnn => true,
     };
     // Tensor cores want 16 bytes of channels. Those of an input are filled up with zeros.

@@ -9,7 +9,7 @@ use crate::kernel::pool::Map;
 use crate::tape::{Node, Tape};
 use candle_core::Tensor;
 
-/// Columns up to this many bytes are kept for the way back. Larger ones are gathered again, or never where cuDNN is there.
+/// Columns up to this many bytes are kept for the way back. Larger ones are gathered again, or left to cuDNN.
 pub(super) const KEPT: usize = 64 << 20;
 /// Numbers that a block of a gather makes, about.
 const GATHERED: usize = 2048;

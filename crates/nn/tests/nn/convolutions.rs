@@ -1,5 +1,5 @@
-//! Convolutions in every precision, through Candle or on a GPU, against our kernels in f32. With `E2H_CONVOLUTION=cudnn` or
-//! `gather` a GPU computes all that it can in that one way.
+//! Convolutions in every precision, through Candle or on a GPU, against our kernels in f32. With `E2H_CONVOLUTION=cudnn` a
+//! GPU leaves to cuDNN all that it can.
 
 use crate::gradients::same_in;
 use crate::support::{device_given, input};

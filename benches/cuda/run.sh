@@ -8,7 +8,8 @@
 #   PYTHON=python3  for compare: one with torch and lerobot 0.4.4; where it has not, they are installed below target/peers
 #
 # Starts what benches/cuda/build.sh left in target/cuda/dist. Needs NVIDIA's driver (580 or newer) and cuBLAS and cuRAND 13: a
-# toolkit's, those beside torch in PYTHON, or else as Python packages below target/cuda/run (about 600 MB).
+# toolkit's, those beside torch in PYTHON, or else as Python packages below target/cuda/run (about 600 MB). cuDNN 9 is found
+# where it lies beside them; E2H_CONVOLUTION=large uses it for large convolutions, E2H_CONVOLUTION=cudnn wherever it can.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 root=$PWD dist=$PWD/target/cuda/dist venv=$PWD/target/cuda/run device=${DEVICE:-cuda} python=${PYTHON:-python3}
@@ -19,11 +20,15 @@ if [ ! -x "$dist/peer" ]; then
 fi
 
 packages() { "$1" -c 'import site, sysconfig; print(*{sysconfig.get_paths()["purelib"], *site.getsitepackages()}, sep="\n")'; }
-folders=()
+folders=() optional=()
 search() {
     local folder
     for folder in "$@"; do
-        if [ -e "$folder/libcublas.so.13" ] || [ -e "$folder/libcurand.so.10" ]; then folders+=("$folder"); fi
+        if [ -e "$folder/libcublas.so.13" ] || [ -e "$folder/libcurand.so.10" ]; then
+            folders+=("$folder")
+        elif [ -e "$folder/libcudnn.so.9" ]; then
+            optional+=("$folder")
+        fi
     done
 }
 while read -r site; do search "$site"/nvidia/*/lib; done < <(packages "$python")
@@ -35,6 +40,7 @@ if [ ${#folders[@]} -eq 0 ]; then
     fi
     while read -r site; do search "$site"/nvidia/*/lib; done < <(packages "$venv/bin/python")
 fi
+folders+=(${optional[@]+"${optional[@]}"})
 LIBRARIES=$(IFS=:; echo "${folders[*]}")${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}
 ours() { LD_LIBRARY_PATH=$LIBRARIES "$@"; }
 # The driver compiles each kernel on its first use and keeps it here.

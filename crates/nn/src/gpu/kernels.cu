@@ -125,15 +125,89 @@ COLLECT(collect_over_bf16_4, __nv_bfloat16, true, 4)
 
 static __device__ __forceinline__ size_t index() { return (size_t)blockIdx.x * blockDim.x + threadIdx.x; }
 
+// Four numbers a thread.
 extern "C" __global__ void to_bf16(const float *x, __nv_bfloat16 *y, size_t n) {
-    size_t i = index();
-    if (i < n) y[i] = __float2bfloat16(x[i]);
+    size_t i = 4 * index();
+    if (i + 4 <= n && reinterpret_cast<uintptr_t>(x) % 16 == 0) {
+        put4(y + i, get4(x + i));
+    } else {
+        for (size_t end = i + 4 < n ? i + 4 : n; i < end; ++i) put(y + i, x[i]);
+    }
 }
 
 extern "C" __global__ void add_bias(float *y, const float *bias, size_t n, int width) {
     size_t i = index();
     if (i < n) y[i] += bias[i % width];
 }
+
+// ------------------------------------------------------------------------------------------------- what cuDNN reads and writes
+
+// Four numbers a thread, of rows of `width`; `bias` may be null. n and width are multiples of four.
+extern "C" __global__ void from_bf16(const __nv_bfloat16 *x, const float *bias, float *y, size_t n, int width) {
+    size_t i = 4 * index();
+    if (i >= n) return;
+    float4 v = get4(x + i);
+    if (bias) {
+        const float *b = bias + i % width;
+        v = make_float4(v.x + b[0], v.y + b[1], v.z + b[2], v.w + b[3]);
+    }
+    put4(y + i, v);
+}
+
+// Rows of c numbers to rows of `wide`, zeros behind them: n = rows wide.
+template <typename T> static __device__ __forceinline__ void pad(const float *x, T *y, size_t n, int c, int wide) {
+    size_t i = index();
+    if (i >= n) return;
+    int j = i % wide;
+    put(y + i, j < c ? x[i / wide * c + j] : 0.0f);
+}
+
+// The way back: n = rows c.
+template <typename T> static __device__ __forceinline__ void cut(const T *x, float *y, size_t n, int c, int wide) {
+    size_t i = index();
+    if (i < n) y[i] = get(x + i / c * wide + i % c);
+}
+
+// Weights (taps c, n) to filters (n, taps wide), zeros in the channels from c on. A block of 32 by 8 threads turns a tile of
+// 32 by 32; rows = taps wide.
+template <typename T> static __device__ __forceinline__ void fold(const float *w, T *out, int c, int wide, int rows, int n) {
+    __shared__ float tile[32][33];
+    int across = (n + 31) / 32, r0 = blockIdx.x / across * 32, k0 = blockIdx.x % across * 32, t = threadIdx.x;
+    for (int i = threadIdx.y; i < 32; i += 8) {
+        int r = r0 + i, j = r % wide;
+        tile[i][t] = r < rows && k0 + t < n && j < c ? w[((size_t)(r / wide) * c + j) * n + k0 + t] : 0.0f;
+    }
+    __syncthreads();
+    for (int i = threadIdx.y; i < 32; i += 8) {
+        if (r0 + t < rows && k0 + i < n) put(out + (size_t)(k0 + i) * rows + r0 + t, tile[t][i]);
+    }
+}
+
+// The way back, for the gradient.
+template <typename T> static __device__ __forceinline__ void unfold(const T *x, float *w, int c, int wide, int rows, int n) {
+    __shared__ float tile[32][33];
+    int across = (n + 31) / 32, r0 = blockIdx.x / across * 32, k0 = blockIdx.x % across * 32, t = threadIdx.x;
+    for (int i = threadIdx.y; i < 32; i += 8) {
+        tile[i][t] = r0 + t < rows && k0 + i < n ? get(x + (size_t)(k0 + i) * rows + r0 + t) : 0.0f;
+    }
+    __syncthreads();
+    for (int i = threadIdx.y; i < 32; i += 8) {
+        int r = r0 + i, j = r % wide;
+        if (r < rows && k0 + t < n && j < c) w[((size_t)(r / wide) * c + j) * n + k0 + t] = tile[t][i];
+    }
+}
+
+#define FOR_CUDNN(SUFFIX, T)                                                                                                 \
+    extern "C" __global__ void pad_##SUFFIX(const float *x, T *y, size_t n, int c, int wide) { pad<T>(x, y, n, c, wide); }   \
+    extern "C" __global__ void cut_##SUFFIX(const T *x, float *y, size_t n, int c, int wide) { cut<T>(x, y, n, c, wide); }   \
+    extern "C" __global__ void fold_##SUFFIX(const float *w, T *out, int c, int wide, int rows, int n) {                     \
+        fold<T>(w, out, c, wide, rows, n);                                                                                   \
+    }                                                                                                                        \
+    extern "C" __global__ void unfold_##SUFFIX(const T *x, float *w, int c, int wide, int rows, int n) {                     \
+        unfold<T>(x, w, c, wide, rows, n);                                                                                   \
+    }
+FOR_CUDNN(f32, float)
+FOR_CUDNN(bf16, __nv_bfloat16)
 
 // ------------------------------------------------------------------------------------------------------------------- sums
 

@@ -1,6 +1,6 @@
 //! The layers: what each launches forward, and on the way back.
 
-use super::{Arg, Gpu, Sizes, shaped};
+use super::{Arg, Gpu, Sizes, cudnn, shaped};
 use crate::builder::Weight;
 use crate::error::Result;
 use crate::kernel::conv::Geo;
@@ -9,8 +9,8 @@ use crate::kernel::pool::Map;
 use crate::tape::{Node, Tape};
 use candle_core::Tensor;
 
-/// Columns up to this many bytes are kept for the way back; larger ones are gathered again.
-const KEPT: usize = 64 << 20;
+/// Columns up to this many bytes are kept for the way back. Larger ones are gathered again, or left to cuDNN.
+pub(super) const KEPT: usize = 64 << 20;
 /// Numbers that a block of a gather makes, about.
 const GATHERED: usize = 2048;
 
@@ -111,6 +111,9 @@ pub(crate) fn convolution(
     let way = Way::new(g, transposed, weight.bf16);
     let xt = tape.tensor(x)?.clone();
     let gpu = Gpu::of(&xt)?;
+    if !transposed && let Some(plan) = cudnn::plan(&gpu, g, &xt, way.bf16)? {
+        return cudnn::convolution(tape, x, (weight, bias), plan, shape);
+    }
     let columns = way.columns(&gpu, &xt)?;
     let w = way.factor(&gpu, &weight.tensor.detach())?;
     let y = gpu.empty(shape)?;

@@ -1,10 +1,11 @@
-//! The same layers on NVIDIA GPUs: kernels of our own around products of cuBLAS.
+//! The same layers on NVIDIA GPUs: kernels of our own around products of cuBLAS, and of cuDNN for large convolutions.
 //!
 //! A network is one node of Candle's graph here too: its tape ([`flow`]) keeps what the way back needs, and weight gradients
 //! go straight to the list that [`crate::backward`] collects. Everything is put on the one stream of the device, in order, so
 //! nothing waits and memory can be handed back while kernels that read it are still to come.
 #![allow(unsafe_code, reason = "launches and raw pointers to memory of the device")]
 
+mod cudnn;
 mod flow;
 mod layers;
 mod optim;
@@ -26,12 +27,12 @@ use half::bf16;
 use std::cell::RefCell;
 use std::collections::HashMap;
 use std::ffi::c_void;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 /// Made by the build script.
 const PTX: &str = include_str!(concat!(env!("OUT_DIR"), "/kernels.ptx"));
 
-const NAMES: [&str; 43] = [
+const NAMES: [&str; 52] = [
     "under_f32_1",
     "under_f32_4",
     "under_bf16_1",
@@ -50,6 +51,15 @@ const NAMES: [&str; 43] = [
     "collect_over_bf16_4",
     "to_bf16",
     "add_bias",
+    "from_bf16",
+    "pad_f32",
+    "pad_bf16",
+    "cut_f32",
+    "cut_bf16",
+    "fold_f32",
+    "fold_bf16",
+    "unfold_f32",
+    "unfold_bf16",
     "column_sums",
     "mish_forward",
     "mish_backward",
@@ -84,6 +94,9 @@ const THREADS: u32 = 256;
 pub(crate) struct Gpu {
     device: CudaDevice,
     functions: HashMap<&'static str, CudaFunction>,
+    choice: cudnn::Choice,
+    /// Opened at the first convolution that it is to compute; or why it cannot be.
+    cudnn: OnceLock<std::result::Result<cudnn::Cudnn, String>>,
 }
 
 static OPENED: Mutex<Vec<(DeviceId, Arc<Gpu>)>> = Mutex::new(Vec::new());
@@ -111,7 +124,7 @@ pub(crate) enum Arg<'a> {
 
 /// [`Geo`] as kernels read it.
 #[repr(C)]
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Sizes([i32; 13]);
 
 impl Sizes {
@@ -172,7 +185,12 @@ impl Gpu {
             let function = device.get_or_load_custom_func(name, "e2h", PTX)?;
             functions.insert(name, function.into_cuda_function());
         }
-        Ok(Self { device: device.clone(), functions })
+        Ok(Self {
+            device: device.clone(),
+            functions,
+            choice: cudnn::Choice::asked()?,
+            cudnn: OnceLock::new(),
+        })
     }
 
     /// Memory whose numbers the next kernel sets.
@@ -277,8 +295,8 @@ impl Gpu {
 
     /// `x` in bf16.
     pub(crate) fn bf16(&self, x: &Tensor) -> candle_core::Result<Tensor> {
-        let y = self.empty_bf16(x.shape())?;
-        self.each("to_bf16", x.elem_count(), &[Arg::T(x), Arg::T(&y), Arg::N(x.elem_count())])?;
+        let (y, n) = (self.empty_bf16(x.shape())?, x.elem_count());
+        self.each("to_bf16", n.div_ceil(4), &[Arg::T(x), Arg::T(&y), Arg::N(n)])?;
         Ok(y)
     }
 

@@ -1,13 +1,13 @@
 //! Every gradient against central finite differences, and Candle's operations against our kernels.
 
 use crate::support::{
-    assert_close, compute, elsewhere, fill, filled, input, loss, loss64, rng, values, wide,
+    assert_close, compute, elsewhere, fill, filled, in_precision, input, loss, loss64, rng, values, wide,
 };
 use candle_core::{Device, Tensor, Var};
 use e2h_nn::{
     Act, Builder, ConditionalUnet1d, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d,
-    Mish, Mlp, Mode, Params, Relu, Result, RgbEncoder, RgbEncoderConfig, SpatialSoftmax, UnetConfig, Weights,
-    backward, dropout, mse, repeat_rows,
+    Mish, Mlp, Mode, Params, Precision, Relu, Result, RgbEncoder, RgbEncoderConfig, SpatialSoftmax,
+    UnetConfig, Weights, backward, dropout, mse, repeat_rows,
 };
 use rand_chacha::ChaCha8Rng;
 
@@ -55,9 +55,22 @@ pub(crate) fn same_through_candle<T>(
     build: impl Fn(&Builder<'_>) -> Result<T>,
     forward: impl Fn(&T, &[Tensor]) -> Result<Tensor>,
 ) {
+    same_in(Precision::default(), what, inputs, (1e-5, tolerance), build, forward);
+}
+
+/// The same with products of this precision, against f32; the tolerances are those of the output and of gradients.
+pub(crate) fn same_in<T>(
+    precision: Precision,
+    what: &str,
+    inputs: &[Tensor],
+    (near, tolerance): (f64, f64),
+    build: impl Fn(&Builder<'_>) -> Result<T>,
+    forward: impl Fn(&T, &[Tensor]) -> Result<Tensor>,
+) {
     let (out, gradients, weights) = outcome(inputs, &build, &forward);
-    let (c_out, c_gradients, c_weights) = elsewhere(|| outcome(inputs, &build, &forward));
-    assert_close(&format!("{what} through Candle"), &wide(&c_out), &wide(&out), 1e-5);
+    let other = || in_precision(precision, || outcome(inputs, &build, &forward));
+    let (c_out, c_gradients, c_weights) = elsewhere(other);
+    assert_close(&format!("{what} through Candle"), &wide(&c_out), &wide(&out), near);
     for (k, (c, g)) in c_gradients.iter().zip(&gradients).enumerate() {
         assert_close(&format!("{what} through Candle, input {k}"), &wide(c), &wide(g), tolerance);
     }

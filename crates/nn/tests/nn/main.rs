@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 mod candle;
+mod convolutions;
 mod examples;
 mod files;
 mod golden;

@@ -9,6 +9,7 @@ use std::cell::Cell;
 
 thread_local! {
     static ELSEWHERE: Cell<bool> = const { Cell::new(false) };
+    static PRECISION: Cell<Precision> = const { Cell::new(Precision { tf32: false, bf16: false }) };
 }
 
 /// The device that `E2H_TEST_DEVICE` names, opened once.
@@ -23,7 +24,30 @@ fn named() -> Option<&'static Compute> {
 
 /// Where tensors and networks are made now.
 pub(crate) fn compute() -> Compute {
-    named().filter(|_| ELSEWHERE.get()).cloned().unwrap_or_default()
+    let place = named().filter(|_| ELSEWHERE.get()).cloned().unwrap_or_default();
+    match PRECISION.get() {
+        p if p == Precision::default() => place,
+        p => Compute::open(place.name(), p).unwrap(),
+    }
+}
+
+/// Whether `E2H_TEST_DEVICE` names a device.
+pub(crate) fn device_given() -> bool {
+    named().is_some()
+}
+
+/// Runs `f` with products of this precision.
+pub(crate) fn in_precision<R>(precision: Precision, f: impl FnOnce() -> R) -> R {
+    struct Restore(Precision);
+    impl Drop for Restore {
+        fn drop(&mut self) {
+            PRECISION.set(self.0);
+            // TF32 is a switch of the whole process.
+            Compute::open(compute().name(), self.0).unwrap();
+        }
+    }
+    let _restore = Restore(PRECISION.replace(precision));
+    f()
 }
 
 /// Runs `f` on Candle's operations: on the device that `E2H_TEST_DEVICE` names (`benches/cuda/run.sh`), else on the CPU.

@@ -1,35 +1,66 @@
 //! What every benchmark example has: a command line, a way to end, and words.
 
-use auto_e2h::core::{Failure, mention, say};
+use auto_e2h::core::{Failure, Team, mention, say};
 pub(crate) use auto_e2h::learn::Run;
 use auto_e2h::learn::record::RunResults;
 use auto_e2h::learn::{Error, Parts, Result, RunOptions, Stop, report};
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, ValueEnum};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 /// What a run ends with: its results, and where its page is.
 pub(crate) type Learned = (RunResults, PathBuf);
 
 /// Learns a pair with what the command line asks for, and tells how it went. SIGINT and SIGTERM end it with its state saved, and
-/// with status 130 and 143.
+/// with status 130 and 143. Started several times by `mpirun` or `srun`, all processes learn together.
 pub(crate) fn main(task: &str, parts: Parts, learn: fn(&Run) -> Result<Learned>) -> ExitCode {
-    let done = options(task)
-        .and_then(|o| Run::open_with(&o, &parts))
+    let options = options(task);
+    let team = match auto_e2h::mpi::team() {
+        Ok(team) => team,
+        Err(error) => {
+            if speaks() {
+                mention(format_args!("Error: {error}"));
+            }
+            return ExitCode::FAILURE;
+        }
+    };
+    let done = options
+        .and_then(|o| Run::open_team(&o, &parts, team.clone()))
         .and_then(|run| run.learn_alone().unwrap_or_else(|| learn(&run)));
     let told = match done {
+        // The first rank has said it, and ends all; if it cannot, this one does.
+        Err(Error::Led(_)) => {
+            std::thread::sleep(Duration::from_secs(5));
+            team.abort("", 1);
+        }
+        Ok(_) if team.rank() > 0 => return ExitCode::SUCCESS,
         Ok((results, page)) => say(report::table::iterations(&results))
             .and_then(|()| say(format_args!("report: {}", page.display())))
             .map_err(Failure::from),
         Err(Error::Stopped { signal }) => {
             mention(Error::Stopped { signal });
-            return ExitCode::from(u8::try_from(128 + signal).unwrap_or(1));
+            return ended(&*team, u8::try_from(128 + signal).unwrap_or(1));
         }
         Err(error) => Err(Failure::from(error)),
     };
     let Err(failure) = told else { return ExitCode::SUCCESS };
     mention(format_args!("Error: {failure:?}"));
-    ExitCode::FAILURE
+    ended(&*team, 1)
+}
+
+/// Ends this process; with others, ends them too, which would wait for it.
+fn ended(team: &dyn Team, status: u8) -> ExitCode {
+    if team.size() > 1 { team.abort("", status) } else { ExitCode::from(status) }
+}
+
+/// Whether this process tells what is wrong; the others leave it the time to, as the end of one ends all.
+fn speaks() -> bool {
+    let speaks = auto_e2h::mpi::speaks();
+    if !speaks {
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    speaks
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -91,7 +122,10 @@ fn options(task: &str) -> Result<RunOptions> {
         "Examples:\n  cargo run --release --example {example} -- --preset smoke\n  cargo run --release --example {example} -- \
          --seed 1 --set loop.cycles=20"
     ));
-    let a = Arguments::from_arg_matches(&command.get_matches()).unwrap_or_else(|e| e.exit());
+    let a = command
+        .try_get_matches()
+        .and_then(|m| Arguments::from_arg_matches(&m))
+        .unwrap_or_else(|e| if speaks() { e.exit() } else { std::process::exit(e.exit_code()) });
     let preset = match a.preset {
         Preset::Smoke => "smoke",
         Preset::Laptop => "laptop",

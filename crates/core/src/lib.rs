@@ -21,6 +21,7 @@ mod random;
 mod say;
 mod spelling;
 pub mod state;
+mod team;
 mod traits;
 
 pub use episode::{
@@ -32,6 +33,7 @@ pub use pose::{Pose, align_hemisphere, continue_signs};
 pub use random::{Rng, fnv1a, stream};
 pub use say::{mention, say};
 pub use spelling::{nearest, one_line};
+pub use team::{Solo, Team, Threads, all_alike, tree_sum};
 pub use traits::{ActionChunk, Policy};
 
 /// Entries of a state row: eef position 3, eef quaternion 4, object position 3, object quaternion 4, gripper opening 1.
@@ -102,6 +104,14 @@ pub enum Error {
         column: &'static str,
         /// Row index.
         row: usize,
+    },
+    /// Another rank of a team cannot be reached.
+    #[error("rank {rank}: expected an answer, but {problem}")]
+    Team {
+        /// The rank.
+        rank: usize,
+        /// What is known of it.
+        problem: String,
     },
     /// A policy or value function failed; the message is the underlying library's.
     #[error("{0}")]

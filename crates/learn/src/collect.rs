@@ -2,6 +2,7 @@
 
 use crate::config::{AfterFailure, LoopConfig};
 use crate::explore::Wander;
+use crate::gather::{self, Lanes};
 use crate::record::{Automatic, ResetCause};
 use crate::rollout::{self, Finished, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
@@ -61,7 +62,20 @@ pub fn collect(
     images: Option<&ImageStore>,
     progress: &Progress,
 ) -> Result<Collected> {
-    let n = envs.len();
+    collect_lanes(Lanes::alone(envs), hard, easy, config, origin, images, progress)
+}
+
+/// The same over the lanes of a team: at rank 0 what all brought, at the others nothing.
+pub(crate) fn collect_lanes(
+    lanes: Lanes<'_>,
+    hard: &dyn Policy,
+    easy: &dyn Policy,
+    config: &LoopConfig,
+    origin: &Origin,
+    images: Option<&ImageStore>,
+    progress: &Progress,
+) -> Result<Collected> {
+    let Lanes { envs, all: n, team } = lanes;
     if n == 0 {
         return Err(Error::Config("collection needs at least one simulation".to_owned()));
     }
@@ -180,7 +194,6 @@ pub fn collect(
 
     let mut lanes: Vec<Lane<Loop>> = envs
         .into_iter()
-        .enumerate()
         .map(|(i, env)| Lane {
             env,
             rollout: None,
@@ -197,7 +210,8 @@ pub fn collect(
             begin(lane, Direction::Hard)?;
         }
     }
-    let bar = progress.bar("collect", config.cycles as u64);
+    let cycles = lanes.iter().map(|l| l.state.cycles.len()).sum::<usize>();
+    let bar = progress.bar("collect", cycles as u64);
     let summary = |lanes: &[Lane<Loop>]| {
         let sum = |f: fn(&Collected) -> usize| lanes.iter().map(|l| f(&l.state.collected)).sum::<usize>();
         let hard = sum(|c| c.hard.iter().filter(|e| e.outcome.is_success()).count());
@@ -208,7 +222,7 @@ pub fn collect(
             sum(|c| c.easy_rollouts)
         );
         let left: usize = lanes.iter().map(|l| l.state.cycles.len()).sum();
-        (config.cycles - left, text)
+        (cycles - left, text)
     };
     drive(&mut lanes, hard, easy, &|lane, finished, direction| next(lane, finished, direction), |lanes| {
         let (done, text) = summary(lanes);
@@ -235,5 +249,5 @@ pub fn collect(
     all.hard.sort_by_key(|e| e.origin.episode);
     all.easy.sort_by_key(|e| e.origin.episode);
     all.rejected.sort_by_key(|e| e.origin.episode);
-    Ok(all)
+    gather::collected(team, all, images)
 }

@@ -61,6 +61,27 @@ pub enum Error {
         /// What is wrong.
         problem: String,
     },
+    /// Rank 0 of a team failed, and has said so.
+    #[error("{0}")]
+    Led(String),
+    /// Ranks of a team that should have the same weights have others.
+    #[error(
+        "{stage}, step {step}: expected the same weights on all {size} ranks, found others on rank {ranks}: processors that round \
+         differently, or programs that were built differently; start on machines of one kind"
+    )]
+    Unlike {
+        /// The stage.
+        stage: String,
+        /// Steps done in it.
+        step: usize,
+        /// Ranks that differ from rank 0.
+        ranks: String,
+        /// How many ranks there are.
+        size: usize,
+    },
+    /// What came from another rank is not what this one expects.
+    #[error("team: {0}")]
+    Team(String),
     /// Reading or writing failed.
     #[error("{doing} {path}: {source}")]
     Io {

@@ -1,10 +1,12 @@
 //! Success of a policy over trials at fixed seeds.
 
+use crate::gather::{self, Lanes};
 use crate::record::{Evaluation, Trial};
 use crate::rollout::{self, Film, Lane, Rollout, drive};
 use crate::{Error, Progress, Result};
 use e2h_core::{Direction, Image, Outcome, Policy, stream};
 use e2h_env::Env;
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::time::Instant;
 
@@ -48,14 +50,27 @@ struct Queue {
 }
 
 /// Runs the trials of `direction` with these numbers from external resets drawn from `seed`, several simulations side by side: `0..50` are the
-/// first fifty, `50..100` go on from there. `envs` are fresh simulations of the same task, one a lane. Filming changes nothing else: a trial's last bits depend on how many
-/// others the policy answers with it, so a film is of the evaluation itself and shows what was counted.
+/// first fifty, `50..100` go on from there. `envs` are fresh simulations of the same task, one a lane. Filming changes nothing else: a film is of the
+/// evaluation itself and shows what was counted.
 ///
 /// # Errors
 /// Before any trial when there are none or too many, or the film's camera or size is not one; when the observations do not fit the
 /// policy or the simulation fails.
 pub fn evaluate(
-    mut envs: Vec<Env>,
+    envs: Vec<Env>,
+    policy: &dyn Policy,
+    direction: Direction,
+    trials: Range<usize>,
+    seed: u64,
+    filming: Option<&Filming>,
+    progress: &Progress,
+) -> Result<Evaluated> {
+    evaluate_lanes(Lanes::alone(envs), policy, direction, trials, seed, filming, progress)
+}
+
+/// The same over the lanes of a team: every rank has all trials in the end, rank 0 alone the films.
+pub(crate) fn evaluate_lanes(
+    lanes: Lanes<'_>,
     policy: &dyn Policy,
     direction: Direction,
     trials: Range<usize>,
@@ -64,14 +79,14 @@ pub fn evaluate(
     progress: &Progress,
 ) -> Result<Evaluated> {
     let start = Instant::now();
-    let n = envs.len();
+    let Lanes { mut envs, all: n, team } = lanes;
     if n == 0 || trials.is_empty() {
         return Err(Error::Config("evaluation needs at least one simulation and one trial".to_owned()));
     }
     if trials.end > MOST_TRIALS {
         return Err(Error::Config(format!("trials: expected at most {MOST_TRIALS}, got {}", trials.end)));
     }
-    if let (Some(f), Some(env)) = (filming, envs.first_mut()) {
+    if let (Some(f), Some((_, env))) = (filming, envs.first_mut()) {
         env.render(&f.camera, f.size, f.size)?;
     }
     let films = |trial: usize| {
@@ -94,7 +109,6 @@ pub fn evaluate(
     };
     let mut lanes: Vec<Lane<Queue>> = envs
         .into_iter()
-        .enumerate()
         .map(|(i, env)| {
             let mine = trials.clone().skip(i).step_by(n);
             let queue = Queue { trials: mine.rev().collect(), current: 0, done: vec![] };
@@ -104,7 +118,8 @@ pub fn evaluate(
     for lane in &mut lanes {
         begin(lane)?;
     }
-    let bar = progress.bar("evaluate", trials.len() as u64);
+    let own = lanes.iter().map(|l| l.state.trials.len() + usize::from(l.rollout.is_some())).sum::<usize>();
+    let bar = progress.bar("evaluate", own as u64);
     drive(
         &mut lanes,
         policy,
@@ -121,27 +136,32 @@ pub fn evaluate(
             progress.check()
         },
     )?;
-    let mut done: Vec<(usize, Trial, Option<Film>)> = vec![];
-    let mut envs: Vec<Env> = vec![];
+    let (mut mine, mut shot, mut envs) = (vec![], BTreeMap::new(), vec![]);
     for lane in lanes {
-        done.extend(lane.state.done);
+        for (i, trial, film) in lane.state.done {
+            mine.push((i, trial));
+            shot.extend(film.map(|film| (i, film)));
+        }
         envs.push(lane.env);
     }
-    done.sort_by_key(|(i, _, _)| *i);
-    let results: Vec<Trial> = done.iter().map(|(_, t, _)| *t).collect();
+    let mut done = gather::trials(team, &mine)?;
+    let results: Vec<Trial> = done.iter().map(|(_, t)| *t).collect();
     let mut films = vec![];
-    if let (Some(f), Some(env)) = (filming, envs.first_mut()) {
+    if let Some(f) = filming {
         let wanted = match f.trials {
             Filmed::First(n) => n,
             Filmed::FailuresFirst(n) => {
-                done.sort_by_key(|(i, trial, _)| (trial.outcome.is_success(), *i));
+                done.sort_by_key(|(i, trial)| (trial.outcome.is_success(), *i));
                 n
             }
         };
-        for (_, trial, film) in done.iter().take(wanted) {
-            if let Some(film) = film {
-                films.push((trial.outcome, film.draw(env, &f.camera, f.size)?));
-            }
+        for (i, trial) in done.iter().take(wanted) {
+            // Drawn by the rank that has seen it.
+            let drawn = match (shot.get(i), envs.first_mut()) {
+                (Some(film), Some(env)) => Some(film.draw(env, &f.camera, f.size)?),
+                _ => None,
+            };
+            films.extend(gather::film(team, drawn)?.map(|film| (trial.outcome, film)));
         }
     }
     let evaluation = Evaluation::new(results, start.elapsed().as_secs_f64());

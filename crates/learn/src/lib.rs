@@ -22,6 +22,7 @@ mod directory;
 mod error;
 mod evaluate;
 mod explore;
+mod gather;
 pub mod hub;
 pub mod imitation;
 mod method;

@@ -4,7 +4,7 @@
 //! `examples/own_policy.rs` has one.
 
 use crate::{Error, Result, RunConfig};
-use e2h_core::Policy;
+use e2h_core::{Policy, Team};
 use e2h_data::{Normaliser, Source};
 use e2h_nn::{Compute, Weights};
 use e2h_policy::sac::{self, StatePolicy};
@@ -45,6 +45,9 @@ pub struct Job<'a> {
     pub purpose: &'a str,
     /// Where networks are computed.
     pub compute: &'a Compute,
+    /// The ranks that all begin this stage. A class that does not share its steps among them may ignore it: every rank then trains
+    /// the same policy.
+    pub team: &'a dyn Team,
 }
 
 /// A training in progress, one step at a time.
@@ -73,6 +76,15 @@ pub trait Training {
     /// # Errors
     /// When the file is missing, damaged or of another network.
     fn restore(&mut self, file: &Path) -> Result<()>;
+
+    /// Something short that is the same wherever the weights are, and the next gradients would be; none, the default, where ranks
+    /// are not to be compared.
+    ///
+    /// # Errors
+    /// When the data do not fit.
+    fn fingerprint(&self) -> Result<Option<String>> {
+        Ok(None)
+    }
 
     /// The policy to act with.
     ///
@@ -127,7 +139,11 @@ impl Training for DiffusionTraining<'_> {
     }
 
     fn step(&mut self) -> Result<f32> {
-        Ok(self.trainer.step(&self.data)?)
+        Ok(self.trainer.step_with(&self.data, self.job.team)?)
+    }
+
+    fn fingerprint(&self) -> Result<Option<String>> {
+        Ok(Some(self.trainer.fingerprint(&self.data)?))
     }
 
     fn mean_loss(&self) -> f64 {

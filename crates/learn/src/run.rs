@@ -9,6 +9,7 @@ mod options;
 mod round;
 mod share;
 mod stage;
+mod team;
 mod tr_drl;
 mod train;
 
@@ -20,7 +21,7 @@ use crate::policy_class::{Diffusion, PolicyClass};
 use crate::record::RunResults;
 use crate::tensorboard::Events;
 use crate::{Error, Progress, Result};
-use e2h_core::{Direction, Episode, Kind, Origin};
+use e2h_core::{Direction, Episode, Kind, Origin, Solo, Team};
 use e2h_data::{Normaliser, NormaliserConfig};
 use e2h_env::{Env, Task, demonstrate, demonstration_stream};
 use e2h_nn::Compute;
@@ -28,6 +29,7 @@ use e2h_policy::Provenance;
 use e2h_refine::{kinematic_filter, reverse};
 use e2h_report::folder::{Given, Identity, LAYOUT};
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::sync::Arc;
 
 use given::GivenDataset;
@@ -35,6 +37,7 @@ pub use options::{BuildTask, Parts, RunOptions, set_threads};
 pub use round::Accepted;
 pub(crate) use round::Toolbox;
 pub use stage::{Json, Stored};
+use team::{Ranks, lead, lead_alone};
 
 /// Where demonstrations of the hard direction lie, for methods that ask for them.
 const HARD_DEMONSTRATIONS: &str = "demonstrations_hard";
@@ -51,6 +54,7 @@ pub struct Run {
     method: Arc<dyn Method>,
     class: Arc<dyn PolicyClass>,
     env: Env,
+    ranks: Ranks,
     /// Demonstrations that the run was given; none where it records its own, or has its copy already.
     given: Option<GivenDataset>,
 }
@@ -82,6 +86,42 @@ impl Run {
     /// # Errors
     /// As [`Run::open`].
     pub fn open_with(options: &RunOptions, parts: &Parts) -> Result<Self> {
+        Self::open_team(options, parts, Rc::new(Solo))
+    }
+
+    /// The same on every rank of a team, each with the same options and parts. Rank 0 alone reads and writes the run directory and
+    /// speaks; the others keep what they need for a moment in the system's folder for such files, which need not be shared.
+    ///
+    /// # Errors
+    /// As [`Run::open`], and when the ranks cannot share a step evenly. An error of rank 0 is [`Error::Led`] at the others.
+    pub fn open_team(options: &RunOptions, parts: &Parts, team: Rc<dyn Team>) -> Result<Self> {
+        let opened = lead_alone(&*team, || Self::open_as(options, parts, team.clone(), None))?;
+        let identity = || opened.as_ref().map(|run| run.identity.clone());
+        let identity = lead(&*team, || identity().ok_or_else(|| Error::Team("no run".to_owned())))?;
+        if let Some(run) = opened {
+            return Ok(run);
+        }
+        let folder = tempfile::tempdir().map_err(crate::directory::io("creating", &std::env::temp_dir()))?;
+        let options = RunOptions {
+            out: Some(folder.path().to_owned()),
+            demonstrations: None,
+            resume: false,
+            initial_from: None,
+            quiet: true,
+            tensorboard: false,
+            stop: crate::Stop::default(),
+            ..options.clone()
+        };
+        Self::open_as(&options, parts, team, Some((identity, folder)))
+    }
+
+    /// `follows`: rank 0's run, and the folder of another rank.
+    fn open_as(
+        options: &RunOptions,
+        parts: &Parts,
+        team: Rc<dyn Team>,
+        follows: Option<(Identity, tempfile::TempDir)>,
+    ) -> Result<Self> {
         e2h_nn::tune_allocator();
         let entry = methods::find(&options.method)?;
         let (code, values) = entry.read()?;
@@ -105,6 +145,13 @@ impl Run {
         }
         resolved.config.know(&*task);
         let config = &resolved.config;
+        let (shards, ranks) = (config.train.step.shards, team.size());
+        if !shards.is_multiple_of(ranks) {
+            return Err(Error::Config(format!(
+                "train.step.shards: expected a multiple of the {ranks} ranks, got {shards}: start as many ranks as divide it, or \
+                 give --set train.step.shards=N, the same for all tries of a run"
+            )));
+        }
         let compute = Compute::open(&options.device, config.device)?;
         let mut env = Env::new(task.clone(), &config.env)?;
         if !config.policy.cameras.is_empty() {
@@ -128,11 +175,12 @@ impl Run {
             .as_ref()
             .map(|root| GivenDataset::open(root, config, &*task, env.cameras(), asked))
             .transpose()?;
-        identity.given = match &given {
-            Some(given) => Some(given.given.clone()),
+        identity.given = match (&given, &follows) {
+            (Some(given), _) => Some(given.given.clone()),
+            (None, Some((leader, _))) => leader.given.clone(),
             // A run that has its copy goes on without the original.
-            None if options.resume => Directory::given(&path)?,
-            None => None,
+            (None, None) if options.resume => Directory::given(&path)?,
+            (None, None) => None,
         };
         if let (Some(given), None) = (&identity.given, asked) {
             options.set.push(format!("loop.demonstrations={}", given.episodes));
@@ -142,8 +190,21 @@ impl Run {
         method.check(&resolved.config)?;
         let dir = Directory::open(&path, options.resume, &identity, &resolved, &*task)?;
         let progress = Progress::new(options.quiet).stopping(options.stop.clone());
-        let run =
-            Self { options, resolved, dir, progress, compute, task, method, class, identity, env, given };
+        let ranks = Ranks::new(team, follows.map(|(_, folder)| folder));
+        let run = Self {
+            options,
+            resolved,
+            dir,
+            progress,
+            compute,
+            task,
+            method,
+            class,
+            identity,
+            env,
+            ranks,
+            given,
+        };
         if let Some(other) = &run.options.initial_from {
             run.take_over(other)?;
         }
@@ -172,10 +233,6 @@ impl Run {
     #[must_use]
     pub fn iterations(&self) -> u32 {
         self.config().closed_loop.iterations
-    }
-
-    fn envs(&self, n: usize) -> Result<Vec<Env>> {
-        (0..n).map(|_| Ok(self.env.clone_shared()?)).collect()
     }
 
     fn origin(&self, iteration: u32) -> Origin {
@@ -212,10 +269,10 @@ impl Run {
         self.report(&demonstrations, records)
     }
 
-    /// All of it, where the method has a loop of its own ([`Method::learn`]).
+    /// All of it, where the method has a loop of its own ([`Method::learn`]), which runs on rank 0 while the others wait.
     #[must_use]
     pub fn learn_alone(&self) -> Option<Result<(RunResults, PathBuf)>> {
-        self.method.learn(self)
+        self.lead(|| self.method.learn(self).transpose()).transpose()
     }
 
     /// Records the easy demonstrations, or copies those that the run was given, and reverses them into `D_h^(0)`.

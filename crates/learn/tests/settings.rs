@@ -249,6 +249,7 @@ const CHANGES: &[Change] = &[
     ("train.normaliser_margin", Ok((Demonstrate, "0.2"))),
     ("train.step.conditions", Ok((Train, "9"))),
     ("train.step.noises", Ok((Train, "3"))),
+    ("train.step.shards", Ok((Train, "2"))),
     ("train.step.conditioning_dropout", Ok((Train, "0.9"))),
     ("train.step.indicator_dropout", Err(RECAP)),
     ("train.step.observation_noise", Ok((Train, "0.2"))),

@@ -133,6 +133,42 @@ impl Grads {
         Ok(())
     }
 
+    /// Appends all gradients to `out`, in the layout and the order of the parameters; zeros where the loss does not depend on one.
+    ///
+    /// # Errors
+    /// [`Error::OtherParams`] when they are of another network, [`Error::Candle`] when a device fails.
+    pub fn flatten(&self, params: &Params, out: &mut Vec<f32>) -> Result<()> {
+        self.check(params)?;
+        for (g, var) in self.list.iter().zip(params.variables()) {
+            match g {
+                Some(g) => out.extend_from_slice(&g.host()?),
+                None => out.resize(out.len() + var.elem_count(), 0.0),
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes over numbers in the order of [`Grads::flatten`]. Those of a parameter that the loss does not depend on are left out.
+    ///
+    /// # Errors
+    /// [`Error::OtherParams`] when they are of another network or not as many, [`Error::Candle`] when a device fails.
+    pub fn unflatten(&mut self, params: &Params, numbers: &[f32]) -> Result<()> {
+        self.check(params)?;
+        if numbers.len() != params.count() {
+            let (expected, found) = (params.count(), numbers.len());
+            return Err(Error::OtherParams { what: "numbers of gradients", expected, found });
+        }
+        let mut rest = numbers;
+        for (g, var) in self.list.iter_mut().zip(params.variables()) {
+            let (own, after) = rest.split_at(var.elem_count());
+            rest = after;
+            if let Some(g) = g {
+                *g = Numbers::new(own.to_vec(), var, params.backend())?;
+            }
+        }
+        Ok(())
+    }
+
     /// Gradients by parameter name in PyTorch's layout, zeros where the loss does not depend on one.
     ///
     /// # Errors

@@ -77,7 +77,7 @@ pub use layers::{
     Act, Conv1d, Conv2d, ConvTranspose1d, Film, GroupNorm, Linear, MaxPool2d, Mish, Relu, SpatialSoftmax,
     dropout, repeat_rows, sinusoidal_embedding,
 };
-pub use loss::mse;
+pub use loss::{mse, mse_part};
 pub use memory::tune_allocator;
 pub use mlp::Mlp;
 pub use optim::{Adam, AdamConfig, Ema, EmaConfig, LrSchedule, learning_rate};

@@ -41,6 +41,27 @@ impl Step for MseStep {
 /// # Errors
 /// [`Error::Shape`] when the shapes differ, [`Error::Config`] when no row counts.
 pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Result<Tensor> {
+    squared_error(prediction, target, weight, None)
+}
+
+/// The part of a mean squared error that a part of a batch makes: the parts of all, added, are [`mse`] of the whole. A mean of the
+/// parts' own means would count padding of one part as rows of another.
+///
+/// # Shapes
+/// As [`mse`]; `rows` is the sum of the whole batch's weights. A part in which no row counts is 0.
+///
+/// # Errors
+/// [`Error::Shape`] when the shapes differ, [`Error::Config`] when no row of the whole counts.
+pub fn mse_part(prediction: &Tensor, target: &Tensor, weight: &Tensor, rows: f64) -> Result<Tensor> {
+    squared_error(prediction, target, Some(weight), Some(rows))
+}
+
+fn squared_error(
+    prediction: &Tensor,
+    target: &Tensor,
+    weight: Option<&Tensor>,
+    rows: Option<f64>,
+) -> Result<Tensor> {
     let dims = prediction.dims();
     let wrong = |what, expected: String, found: &Tensor| Error::Shape {
         what,
@@ -56,10 +77,10 @@ pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Res
         Some(w) if w.dims() == &dims[..dims.len() - 1] => w.flatten_all()?.to_vec1::<f32>()?,
         Some(w) => return Err(wrong("weight of the loss", format!("{:?}", &dims[..dims.len() - 1]), w)),
     };
-    let rows = match weight {
+    let rows = rows.unwrap_or_else(|| match weight {
         None => (prediction.elem_count() / width.max(1)) as f64,
         Some(_) => weights.iter().map(|w| f64::from(*w)).sum(),
-    };
+    });
     let count = rows * width as f64;
     if count.is_nan() || count <= 0.0 {
         let found = format!("{count}");
@@ -92,4 +113,27 @@ pub fn mse(prediction: &Tensor, target: &Tensor, weight: Option<&Tensor>) -> Res
         let step = MseStep { prediction: n[0], target: n[1], weights, scale, width };
         Ok(tape.push(vec![(sum / count) as f32], [], n, &[], step))
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::{Device, Var};
+
+    #[test]
+    fn parts_of_a_loss_add_up_to_the_whole_also_where_one_is_all_padding() {
+        let numbers = |scale: f32| (0..24_u8).map(|i| scale * f32::from(i % 7)).collect::<Vec<f32>>();
+        let p = Var::from_vec(numbers(0.3), (3, 4, 2), &Device::Cpu).unwrap();
+        let t = Tensor::from_vec(numbers(0.2), (3, 4, 2), &Device::Cpu).unwrap();
+        let mask = [[1f32, 1., 1., 1.], [0., 0., 0., 0.], [1., 0., 0., 0.]];
+        let mask = Tensor::new(&mask, &Device::Cpu).unwrap();
+        let whole = mse(p.as_tensor(), &t, Some(&mask)).unwrap();
+        let of = |i: usize| {
+            let part = |x: &Tensor| x.narrow(0, i, 1).unwrap().contiguous().unwrap();
+            mse_part(&part(p.as_tensor()), &part(&t), &part(&mask), 5.0).unwrap().to_scalar::<f32>().unwrap()
+        };
+        assert_eq!(of(1), 0.0);
+        assert!((of(0) + of(2) - whole.to_scalar::<f32>().unwrap()).abs() < 1e-7);
+        assert!(mse_part(p.as_tensor(), &t, &mask, 0.0).is_err(), "nothing counts anywhere");
+    }
 }

@@ -7,13 +7,15 @@ use crate::lerobot::Features;
 use crate::model::{Widths, widened};
 use crate::{Ddim, DiffusionModel, EncoderNorm, Error, PolicyConfig, Prediction, Result, TrainConfig};
 use candle_core::{Device, Tensor};
-use e2h_core::{ACTION_DIM, Rng, stream};
+use e2h_core::{ACTION_DIM, Rng, Solo, Team, stream};
 use e2h_nn::{
-    Adam, Compute, Ema, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse, repeat_rows,
+    Adam, Compute, Ema, Grads, HostTensor, LrSchedule, Mode, Weights, backward, learning_rate, mse_part,
+    repeat_rows,
 };
 use rand::Rng as _;
 use sha2::{Digest as _, Sha256};
 use std::collections::{BTreeMap, VecDeque};
+use std::ops::Range;
 use std::path::Path;
 
 /// Where a training state's header has its checksum.
@@ -41,7 +43,7 @@ const RECENT: usize = 100;
 ///
 /// # Shapes
 /// `noisy` and `target` (rows, T, action), `timesteps` (rows), `condition` (rows, condition), `mask` (rows, T); a row is one of the
-/// noises of one of the step's conditions.
+/// noises of one of the conditions that were asked for.
 struct Batch {
     noisy: Tensor,
     timesteps: Vec<f32>,
@@ -49,6 +51,8 @@ struct Batch {
     target: Tensor,
     /// On the host, where the loss reads it.
     mask: Tensor,
+    /// Actions that count in the whole step's loss.
+    counted: f64,
 }
 
 /// A policy in training: network, optimiser, average of the weights, step counter.
@@ -196,12 +200,23 @@ impl Trainer {
     /// # Errors
     /// When the data do not fit, the loss is not finite, or the gradient has been too long for several steps.
     pub fn step(&mut self, data: &TrainingData<'_>) -> Result<f32> {
-        // A stream per step: nothing of the generator has to be stored for an exact resume.
-        let mut rng = stream(self.seed, &self.purpose, 0, self.step as u64);
-        let loss = self.loss(data, &mut rng)?;
-        let grads = backward(&loss, &self.model.params)?;
-        // Read only now: a GPU is waited for here, and has all of the way back to do meanwhile.
-        let value = loss.to_scalar::<f32>()?;
+        self.step_with(data, &Solo)
+    }
+
+    /// The same step by all ranks of `team`, which all have to call it on the same data: each computes the gradients of its part of
+    /// the shards ([`TrainConfig::shards`]). The weights have the same bits on all ranks, and whatever the number of ranks.
+    ///
+    /// # Errors
+    /// As [`Trainer::step`]; when the shards cannot be shared evenly, or another rank cannot be reached.
+    pub fn step_with(&mut self, data: &TrainingData<'_>, team: &dyn Team) -> Result<f32> {
+        let (shards, ranks) = (self.train.shards, team.size());
+        if !shards.is_multiple_of(ranks) {
+            return Err(Error::Config(format!(
+                "shards: expected a multiple of the {ranks} ranks, got {shards}"
+            )));
+        }
+        let (value, grads) =
+            if shards == 1 { self.whole_gradient(data)? } else { self.shared_gradient(data, team)? };
         if !value.is_finite() {
             return Err(Error::NotFinite { step: self.step, seed: self.seed, loss: value });
         }
@@ -215,6 +230,70 @@ impl Trainer {
         }
         self.losses.push_back(value);
         Ok(value)
+    }
+
+    /// Loss and gradients of the step's conditions `rows`, as parts of the whole step's.
+    fn part(&self, data: &TrainingData<'_>, rows: Range<usize>) -> Result<(Tensor, Grads)> {
+        // A stream per step: nothing of the generator has to be stored for an exact resume.
+        let mut rng = stream(self.seed, &self.purpose, 0, self.step as u64);
+        let loss = self.loss_of(&self.model, data, &self.train, false, rows, &mut rng)?;
+        let grads = backward(&loss, &self.model.params)?;
+        Ok((loss, grads))
+    }
+
+    fn whole_gradient(&self, data: &TrainingData<'_>) -> Result<(f32, Grads)> {
+        let (loss, grads) = self.part(data, 0..self.train.conditions)?;
+        // Read only now: a GPU is waited for here, and has all of the way back to do meanwhile.
+        Ok((loss.to_scalar::<f32>()?, grads))
+    }
+
+    /// Gradients of a shard, and at their end its part of the loss.
+    fn shard(&self, data: &TrainingData<'_>, shard: usize) -> Result<(Vec<f32>, Grads)> {
+        let each = self.train.conditions / self.train.shards;
+        let (loss, grads) = self.part(data, shard * each..(shard + 1) * each)?;
+        let mut numbers = Vec::with_capacity(self.model.params.count() + 1);
+        grads.flatten(&self.model.params, &mut numbers)?;
+        numbers.push(loss.to_scalar::<f32>()?);
+        Ok((numbers, grads))
+    }
+
+    /// The sum over all shards, in the order of a balanced tree: it is that of the configuration, however many ranks there are.
+    fn shared_gradient(&self, data: &TrainingData<'_>, team: &dyn Team) -> Result<(f32, Grads)> {
+        let own = self.train.shards / team.size();
+        // Sums of 1, 2, 4, ... neighbours, the largest first.
+        let mut sums: Vec<(usize, Vec<f32>)> = vec![];
+        let mut latest = None;
+        for shard in team.rank() * own..(team.rank() + 1) * own {
+            let (mut numbers, grads) = self.shard(data, shard)?;
+            latest = Some(grads);
+            let mut shards = 1;
+            while let Some((_, mut before)) = sums.pop_if(|(n, _)| *n == shards) {
+                before.iter_mut().zip(&numbers).for_each(|(a, b)| *a += b);
+                (numbers, shards) = (before, 2 * shards);
+            }
+            sums.push((shards, numbers));
+        }
+        let (Some((_, mut numbers)), Some(mut grads)) = (sums.pop(), latest) else {
+            return Err(Error::Config(format!("shards: expected at least 1, got {}", self.train.shards)));
+        };
+        team.sum(&mut numbers)?;
+        // With the gradients, so that a loss that is no number ends all ranks at the same step.
+        let value = numbers.pop().unwrap_or(f32::NAN);
+        grads.unflatten(&self.model.params, &numbers)?;
+        Ok((value, grads))
+    }
+
+    /// SHA-256 of the weights, of the optimiser's state and of a gradient: where ranks whose numbers should be equal have another, their processors
+    /// round differently.
+    ///
+    /// # Errors
+    /// When the data do not fit.
+    pub fn fingerprint(&self, data: &TrainingData<'_>) -> Result<String> {
+        let mut all = self.model.params.export()?;
+        all.extend(self.adam.state()?.into_iter().map(|(name, t)| (format!("adam/{name}"), t)));
+        let (numbers, _) = self.shard(data, 0)?;
+        all.insert("shard".to_owned(), HostTensor { shape: vec![numbers.len()], data: numbers });
+        Ok(digest(&all))
     }
 
     /// Mean loss of the averaged weights over `batches` batches of `data`, the same ones in every call: crops are centred and
@@ -231,14 +310,10 @@ impl Trainer {
         let mut sum = 0.0;
         for i in 0..batches {
             let rng = &mut stream(self.seed, "validate", 0, i as u64);
-            let loss = self.loss_of(&model, data, &plain, true, rng)?;
+            let loss = self.loss_of(&model, data, &plain, true, 0..plain.conditions, rng)?;
             sum += f64::from(loss.to_scalar::<f32>()?);
         }
         Ok(sum / batches.max(1) as f64)
-    }
-
-    fn loss(&self, data: &TrainingData<'_>, rng: &mut Rng) -> Result<Tensor> {
-        self.loss_of(&self.model, data, &self.train, false, rng)
     }
 
     fn loss_of(
@@ -247,47 +322,58 @@ impl Trainer {
         data: &TrainingData<'_>,
         train: &TrainConfig,
         centred: bool,
+        own: Range<usize>,
         rng: &mut Rng,
     ) -> Result<Tensor> {
-        let batch = self.draw(model, data, train, centred, rng)?;
+        let batch = self.draw(model, data, train, centred, own, rng)?;
         let output = model.forward(&batch.noisy, &batch.timesteps, &batch.condition)?;
-        Ok(mse(&output, &batch.target, Some(&batch.mask))?)
+        Ok(mse_part(&output, &batch.target, &batch.mask, batch.counted)?)
     }
 
+    /// Draws what is random of the whole step, in one order, and builds the conditions `own` of it.
     fn draw(
         &self,
         model: &DiffusionModel,
         data: &TrainingData<'_>,
         t: &TrainConfig,
         centred: bool,
+        own: Range<usize>,
         rng: &mut Rng,
     ) -> Result<Batch> {
         let (c, action) = (&self.config, self.widths.action);
-        let mut batch = BatchBuilder::new(c).of_images(data.columns(c), data.scaling(c));
-        let (per, rows) = (c.horizon * action, t.conditions * t.noises);
-        let mut clean = Vec::with_capacity(t.conditions * per);
+        let builder = || BatchBuilder::new(c).of_images(data.columns(c), data.scaling(c));
+        let (mut batch, mut others) = (builder(), builder());
+        let (per, rows) = (c.horizon * action, own.len() * t.noises);
+        let mut clean = Vec::with_capacity(own.len() * per);
         let mut mask = Vec::with_capacity(rows * c.horizon);
+        let mut counted = 0;
         let first_image = c.n_obs_steps - c.n_image_steps;
         let mut indicators = Vec::with_capacity(rows);
         let examples = data.batch(t.conditions, rng);
         let mut parts = Vec::new();
-        for example in &examples {
-            let (window, indicator) = (&example.window, example.indicator);
-            example.push_state(&mut batch, Some((t.observation_noise, rng)));
+        for (i, example) in examples.iter().enumerate() {
+            let (window, indicator, mine) = (&example.window, example.indicator, own.contains(&i));
+            let to = if mine { &mut batch } else { &mut others };
+            example.push_state(to, Some((t.observation_noise, rng)));
             if c.n_image_steps > 0 {
                 for camera in 0..c.cameras.len() {
                     let corner = example.corner(c, (!centred).then_some(&mut *rng));
-                    let frames = example.frames(c, camera)?;
-                    let rows = window.observations[first_image..].iter();
-                    parts.extend(rows.map(|&row| Part { camera, frames, row, corner }));
+                    if mine {
+                        let frames = example.frames(c, camera)?;
+                        let rows = window.observations[first_image..].iter();
+                        parts.extend(rows.map(|&row| Part { camera, frames, row, corner }));
+                    }
                 }
             }
-            for &row in &window.actions {
-                example.push_action(row, &mut clean);
-            }
-            for _ in 0..t.noises {
-                indicators.push(indicator);
-                mask.extend(window.mask.iter().map(|&m| if m { 1.0f32 } else { 0.0 }));
+            counted += t.noises * window.mask.iter().filter(|m| **m).count();
+            if mine {
+                for &row in &window.actions {
+                    example.push_action(row, &mut clean);
+                }
+                for _ in 0..t.noises {
+                    indicators.push(indicator);
+                    mask.extend(window.mask.iter().map(|&m| if m { 1.0f32 } else { 0.0 }));
+                }
             }
         }
         batch.push_parts(&parts, data.crop(c))?;
@@ -295,10 +381,14 @@ impl Trainer {
         let mut target = Vec::with_capacity(rows * per);
         let mut timesteps = Vec::with_capacity(rows);
         let mut keep = Vec::with_capacity(rows);
-        for sample in clean.chunks_exact(per) {
+        let mut samples = clean.chunks_exact(per);
+        for i in 0..t.conditions {
+            let sample = if own.contains(&i) { samples.next() } else { None };
             for _ in 0..t.noises {
                 let k = rng.random_range(0..c.train_timesteps);
                 let noise: Vec<f32> = (0..per).map(|_| rng.sample(rand_distr::StandardNormal)).collect();
+                let kept = if rng.random::<f32>() < t.conditioning_dropout { 0.0 } else { 1.0f32 };
+                let Some(sample) = sample else { continue };
                 let start = noisy.len();
                 noisy.extend_from_slice(sample);
                 self.ddim.add_noise(&mut noisy[start..], &noise, k);
@@ -307,13 +397,18 @@ impl Trainer {
                     Prediction::Sample => target.extend_from_slice(sample),
                 }
                 timesteps.push(k as f32);
-                keep.push(if rng.random::<f32>() < t.conditioning_dropout { 0.0 } else { 1.0f32 });
+                keep.push(kept);
             }
         }
         if c.indicator {
             // Last, so that all else is drawn as without it.
-            for indicator in &mut indicators {
-                if rng.random::<f32>() < t.indicator_dropout {
+            let mut indicators = indicators.iter_mut();
+            for row in 0..t.conditions * t.noises {
+                let dropped = rng.random::<f32>() < t.indicator_dropout;
+                if own.contains(&(row / t.noises))
+                    && let Some(indicator) = indicators.next()
+                    && dropped
+                {
                     *indicator = 0.0;
                 }
             }
@@ -334,6 +429,7 @@ impl Trainer {
             condition,
             target: Tensor::from_vec(target, shape, device)?,
             mask: Tensor::from_vec(mask, (rows, c.horizon), &Device::Cpu)?,
+            counted: counted as f64,
         })
     }
 
@@ -431,7 +527,7 @@ mod tests {
         let data = TrainingData::new(&sources, config, &normaliser).unwrap();
         let trainer = Trainer::new(config, train, 1, None, 1, "test").unwrap();
         let rng = &mut stream(1, "test", 0, step);
-        let batch = trainer.draw(&trainer.model, &data, train, false, rng).unwrap();
+        let batch = trainer.draw(&trainer.model, &data, train, false, 0..train.conditions, rng).unwrap();
         let rows = batch.condition.to_vec2::<f32>().unwrap();
         assert_eq!(rows[0].len(), config.condition_dim());
         let observed = config.condition_dim() - usize::from(config.indicator);
@@ -449,6 +545,7 @@ mod tests {
         let train = |indicator_dropout: f32, conditioning_dropout: f32| TrainConfig {
             conditions: 16,
             noises: 2,
+            shards: 1,
             conditioning_dropout,
             indicator_dropout,
             observation_noise: 0.1,

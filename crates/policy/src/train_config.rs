@@ -14,6 +14,11 @@ pub struct TrainConfig {
     /// (noise, diffusion step) pairs drawn for each of them, so that the costly image encoding is shared. Source: Mini
     /// Diffuser, arXiv 2505.09430.
     pub noises: usize,
+    /// Equal parts of a step's observations whose gradients are computed each by itself and added in the order of a balanced tree; a
+    /// power of two. So many ranks, or a divisor of it, may share a step ([`Trainer::step_with`](crate::Trainer::step_with)): it is
+    /// the shards that results depend on, in their last bits, and not the ranks.
+    #[serde(default = "one_shard", skip_serializing_if = "is_one_shard")]
+    pub shards: usize,
     /// Probability that a sample's whole condition is zeroed.
     pub conditioning_dropout: f32,
     /// Probability that a sample's indicator is set to 0, apart from its observation; without effect on policies without
@@ -67,6 +72,13 @@ impl TrainConfig {
             format!(
                 "conditions and noises: expected at least 1 and a product of at most {MOST_SAMPLES}, got {} and {}",
                 self.conditions, self.noises
+            ),
+        );
+        check(
+            self.shards.is_power_of_two() && self.conditions.is_multiple_of(self.shards),
+            format!(
+                "shards: expected a power of two that divides conditions ({}), got {}",
+                self.conditions, self.shards
             ),
         );
         check(
@@ -243,6 +255,15 @@ impl CriticConfig {
         }
         problems
     }
+}
+
+fn one_shard() -> usize {
+    1
+}
+
+// Serde's signature.
+fn is_one_shard(shards: &usize) -> bool {
+    *shards == 1
 }
 
 fn one() -> f32 {

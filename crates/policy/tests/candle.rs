@@ -64,6 +64,7 @@ fn train_config() -> TrainConfig {
     TrainConfig {
         conditions: 8,
         noises: 2,
+        shards: 1,
         conditioning_dropout: 0.2,
         indicator_dropout: 0.3,
         observation_noise: 0.05,

@@ -32,6 +32,7 @@ fn train_config() -> TrainConfig {
     TrainConfig {
         conditions: 16,
         noises: 2,
+        shards: 1,
         conditioning_dropout: 0.0,
         indicator_dropout: 0.3,
         observation_noise: 0.0,

@@ -62,6 +62,7 @@ fn train(conditions: usize) -> TrainConfig {
     TrainConfig {
         conditions,
         noises: 2,
+        shards: 1,
         conditioning_dropout: 0.0,
         indicator_dropout: 0.0,
         observation_noise: 0.0,

@@ -3,7 +3,7 @@
 use super::stage::TrainNotes;
 use super::{Accepted, Demonstrations, HARD_DEMONSTRATIONS, Run, folder, now};
 use crate::Result;
-use crate::evaluate::{Filmed, Filming, evaluate};
+use crate::evaluate::{Evaluated, Filmed, Filming, evaluate_lanes};
 use crate::picture;
 use crate::record::{IterationRecord, RunResults};
 use crate::report;
@@ -36,17 +36,32 @@ impl Run {
         accepted: Option<&Accepted>,
     ) -> Result<IterationRecord> {
         let file = folder(iteration, "record.json");
-        if let Some(Measured { record, files }) = self.dir.get(&file)? {
+        let found = self.lead(|| {
+            let Some(Measured { record, files }) = self.dir.get(&file)? else { return Ok(None) };
             self.dir.verify_seals(&files)?;
             self.log(&record)?;
+            Ok(Some(record))
+        })?;
+        if let Some(record) = found {
             return Ok(record);
         }
-        let c = self.config();
-        let e = &c.evaluation;
-        let envs = self.envs(e.parallel.min(e.trials))?;
+        let e = &self.config().evaluation;
+        let lanes = self.lanes(e.parallel.min(e.trials))?;
         let filming = Filming { trials: Filmed::First(e.filmed), camera: "table".to_owned(), size: 160 };
         let filming = (e.filmed > 0).then_some(&filming);
-        let done = evaluate(envs, policy, Direction::Hard, 0..e.trials, e.seed, filming, &self.progress)?;
+        let trials = 0..e.trials;
+        let done = evaluate_lanes(lanes, policy, Direction::Hard, trials, e.seed, filming, &self.progress)?;
+        self.lead(|| self.measured(iteration, &file, done, accepted))
+    }
+
+    /// The row of an evaluation, written beside its pictures.
+    fn measured(
+        &self,
+        iteration: u32,
+        file: &str,
+        done: Evaluated,
+        accepted: Option<&Accepted>,
+    ) -> Result<IterationRecord> {
         let evaluation = done.evaluation;
         if !done.films.is_empty() {
             let path = self.dir.join(folder(iteration, "rollouts.png"));
@@ -85,7 +100,7 @@ impl Run {
         };
         let files = self.dir.seals(&[folder(iteration, "rollouts.png")])?;
         let measured = Measured { record, files };
-        self.dir.put_sealed(&file, &measured)?;
+        self.dir.put_sealed(file, &measured)?;
         let record = measured.record;
         self.log(&record)?;
         self.progress.say(&format!(
@@ -108,6 +123,14 @@ impl Run {
     /// # Errors
     /// When the folder cannot be written.
     pub fn report(
+        &self,
+        demonstrations: &Demonstrations,
+        records: Vec<IterationRecord>,
+    ) -> Result<(RunResults, PathBuf)> {
+        self.lead(|| self.reported(demonstrations, records))
+    }
+
+    fn reported(
         &self,
         demonstrations: &Demonstrations,
         records: Vec<IterationRecord>,

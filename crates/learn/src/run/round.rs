@@ -1,7 +1,7 @@
 //! A round of the loop: collection, the method's lesson, and the account of both.
 
 use super::{Demonstrations, Run, folder, now};
-use crate::collect::{Collected, collect};
+use crate::collect::{Collected, collect_lanes};
 use crate::directory::write_atomic;
 use crate::method::{Lesson, Round, Tools};
 use crate::picture;
@@ -50,22 +50,26 @@ impl Run {
         policy: &dyn Trained,
         make: impl FnOnce() -> Result<Collected>,
     ) -> Result<Accepted> {
-        self.stage(&folder(iteration, "segments"), || {
+        self.stage_of_all(&folder(iteration, "segments"), || {
             let clock = Instant::now();
             let rollouts = make()?;
             let collect = clock.elapsed();
-            let round =
-                Round { config: self.config(), iteration, demonstrations, rollouts: &rollouts, policy };
-            let clock = Instant::now();
-            let lesson = self.method.lesson(&round, &Tools::new(self))?;
-            let refine = clock.elapsed().saturating_sub(lesson.critic_time);
-            let minutes = [("collect", collect), ("refine", refine), ("critic", lesson.critic_time)];
-            let minutes = minutes.map(|(stage, t)| (stage.to_owned(), t.as_secs_f64() / 60.0));
-            self.account(iteration, rollouts, lesson, BTreeMap::from(minutes))
+            // Only rank 0 has all rollouts.
+            self.lead_alone(|| {
+                let round =
+                    Round { config: self.config(), iteration, demonstrations, rollouts: &rollouts, policy };
+                let clock = Instant::now();
+                let lesson = self.method.lesson(&round, &Tools::new(self))?;
+                let refine = clock.elapsed().saturating_sub(lesson.critic_time);
+                let minutes = [("collect", collect), ("refine", refine), ("critic", lesson.critic_time)];
+                let minutes = minutes.map(|(stage, t)| (stage.to_owned(), t.as_secs_f64() / 60.0));
+                self.account(iteration, rollouts, lesson, BTreeMap::from(minutes))
+            })
         })
     }
 
-    /// Closed-loop collection with both policies.
+    /// Closed-loop collection with both policies, whose loops are spread over the ranks: rank 0 gets what all brought, the others
+    /// nothing.
     ///
     /// # Errors
     /// When the simulation fails, or rollouts are to be kept and cannot be written.
@@ -74,15 +78,19 @@ impl Run {
         // A store of its own, which goes with the rollouts: few of them become segments.
         let images = ImageStore::create(self.path())?;
         let origin = self.origin(iteration);
-        let collected = collect(self.envs(c.loops)?, hard, easy, c, &origin, Some(&images), &self.progress)?;
-        let place = folder(iteration, "rollouts");
-        if c.keep_rollouts && !self.dir.join(&place).exists() {
-            let mut all: Vec<&Episode> =
-                collected.hard.iter().chain(&collected.easy).chain(&collected.rejected).collect();
-            // As they happened: of a cycle the hard rollout, then the easy one.
-            all.sort_by_key(|e| (e.origin.episode, e.origin.direction == Direction::Easy));
-            self.dir.put_episodes(&place, &all, &collected.resets)?;
-        }
+        let lanes = self.lanes(c.loops)?;
+        let collected = collect_lanes(lanes, hard, easy, c, &origin, Some(&images), &self.progress)?;
+        self.lead(|| {
+            let place = folder(iteration, "rollouts");
+            if c.keep_rollouts && !self.dir.join(&place).exists() {
+                let mut all: Vec<&Episode> =
+                    collected.hard.iter().chain(&collected.easy).chain(&collected.rejected).collect();
+                // As they happened: of a cycle the hard rollout, then the easy one.
+                all.sort_by_key(|e| (e.origin.episode, e.origin.direction == Direction::Easy));
+                self.dir.put_episodes(&place, &all, &collected.resets)?;
+            }
+            Ok(())
+        })?;
         Ok(collected)
     }
 

@@ -24,6 +24,11 @@ pub trait Stored: Sized {
     /// When a file cannot be read, or is not what was written.
     fn read(run: &Run, place: &str) -> Result<Option<Self>>;
 
+    /// Files and folders below the run directory that [`Stored::read`] needs: what is sent to other ranks.
+    fn places(place: &str) -> Vec<String> {
+        vec![place.to_owned()]
+    }
+
     /// Writes it there. `minutes` is how long the stage took, over all processes that worked on it.
     ///
     /// # Errors
@@ -37,18 +42,42 @@ pub struct Json<T>(pub T);
 
 impl Run {
     /// What is at `place` below the run directory; or what `make` makes, which is timed and stored there. `make` is called only if
-    /// its result is needed.
+    /// its result is needed, and on rank 0 alone.
     ///
     /// # Errors
     /// Those of `make`; when what is there is not what was written, or the folder cannot be written.
     pub fn stage<T: Stored>(&self, place: &str, make: impl FnOnce() -> Result<T>) -> Result<T> {
-        if let Some(found) = T::read(self, place)? {
-            return Ok(found);
+        self.stage_of_all(place, || self.lead_alone(make))
+    }
+
+    /// The same where all ranks have to call `make`; that of rank 0 returns what is stored, and the others read it.
+    pub(super) fn stage_of_all<T: Stored>(
+        &self,
+        place: &str,
+        make: impl FnOnce() -> Result<Option<T>>,
+    ) -> Result<T> {
+        let mut own = None;
+        let there = self.lead(|| {
+            own = T::read(self, place)?;
+            Ok(own.is_some())
+        })?;
+        if !there {
+            let (clock, spent) = (Instant::now(), self.spent(place)?);
+            let made = make()?;
+            self.lead(|| {
+                let minutes = spent + clock.elapsed().as_secs_f64() / 60.0;
+                made.as_ref().map_or(Ok(()), |made| made.write(self, place, minutes))?;
+                own = made;
+                Ok(())
+            })?;
         }
-        let (clock, spent) = (Instant::now(), self.spent(place)?);
-        let made = make()?;
-        made.write(self, place, spent + clock.elapsed().as_secs_f64() / 60.0)?;
-        Ok(made)
+        let places = T::places(place);
+        self.send(&places)?;
+        if self.team().rank() != 0 {
+            own = T::read(self, place)?;
+            self.forget(&places)?;
+        }
+        own.ok_or_else(|| Error::Team(format!("{place}: expected what rank 0 has, found nothing")))
     }
 
     /// Minutes that earlier processes spent on a stage that goes on from where they saved it.
@@ -121,6 +150,10 @@ impl Stored for Accepted {
         }
         let segments = segments.into_iter().map(Arc::new).collect();
         Ok(Some(Self { segments, easy, collection: notes.collection, stage_minutes: notes.stage_minutes }))
+    }
+
+    fn places(place: &str) -> Vec<String> {
+        vec![place.to_owned(), easy_place(place)]
     }
 
     fn write(&self, run: &Run, place: &str, _: f64) -> Result<()> {

@@ -130,7 +130,7 @@ impl Run {
     fn train(&self, stage: Stage<'_>, normaliser: &Normaliser) -> Result<Box<dyn Trained>> {
         let Stage { place, name, direction, iteration, steps, sources, start } = stage;
         let provenance = self.provenance(direction, iteration)?;
-        let done = self.stage(&place, || {
+        let done = self.stage_of_all(&place, || {
             let clock = Instant::now();
             let spent = self.spent(&place)?;
             let c = self.config();
@@ -146,10 +146,14 @@ impl Run {
                 seed: self.options.seed,
                 purpose: &purpose,
                 compute: &self.compute,
+                team: self.team(),
             })?;
-            let saved = self.dir.join(format!("{place}/{TRAINING}"));
-            if saved.exists() {
+            let state = [format!("{place}/{TRAINING}")];
+            let saved = self.dir.join(&state[0]);
+            if self.lead(|| Ok(saved.exists()))? {
+                self.send(&state)?;
                 training.restore(&saved)?;
+                self.forget(&state)?;
             }
             let mut events = match training.step_count() {
                 done if done < steps => {
@@ -158,14 +162,18 @@ impl Run {
                 _ => None,
             };
             while training.step_count() < steps {
-                let stopped = self.progress.check();
+                let stopped = self.lead(|| self.progress.check());
                 let done = training.step_count();
                 let due = done % c.train.save_every == 0 && done > 0;
                 if stopped.is_err() || due {
-                    let folder = self.dir.join(&place);
-                    std::fs::create_dir_all(&folder).map_err(crate::directory::io("creating", &folder))?;
-                    training.save(&saved)?;
-                    self.spend(&place, spent + clock.elapsed().as_secs_f64() / 60.0)?;
+                    self.compare_ranks(&*training, &name)?;
+                    self.lead(|| {
+                        let folder = self.dir.join(&place);
+                        std::fs::create_dir_all(&folder)
+                            .map_err(crate::directory::io("creating", &folder))?;
+                        training.save(&saved)?;
+                        self.spend(&place, spent + clock.elapsed().as_secs_f64() / 60.0)
+                    })?;
                 }
                 stopped?;
                 let loss = training.step()?;
@@ -179,9 +187,12 @@ impl Run {
                 }
             }
             events.map(Events::finish).transpose()?;
+            if steps > 0 {
+                self.compare_ranks(&*training, &name)?;
+            }
             let loss = training.mean_loss();
             bar.finish(&format!("{steps} steps, loss {loss:.4}"));
-            Ok(PolicyStage { policy: training.policy()?, loss, steps, provenance })
+            Ok(Some(PolicyStage { policy: training.policy()?, loss, steps, provenance }))
         })?;
         Ok(done.policy)
     }

@@ -52,7 +52,7 @@ fn what_needs_no_network_and_no_simulator_stands_on_neither() {
         match name.as_str() {
             "core" | "nn" => assert!(own.is_empty(), "{name} depends on {own:?}"),
             "refine" | "data" => assert_eq!(own, ["e2h-core"], "{name}"),
-            "serve" => assert_eq!(own, ["e2h-core", "e2h-data", "e2h-policy"], "{name}"),
+            "serve" => assert_eq!(own, ["e2h-core", "e2h-data", "e2h-nn", "e2h-policy"], "{name}"),
             "report" => assert_eq!(own, ["e2h-core", "e2h-data", "e2h-refine"], "{name}"),
             _ => {}
         }

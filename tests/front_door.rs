@@ -37,7 +37,7 @@ fn it_lists_everything_there_is() {
         assert!(listed.lines().any(|l| l.split_whitespace().next() == Some(&name)), "{name} in {listed}");
     }
     assert!(
-        listed.contains("50 of 50; nut_assembly (loose) from 10") && !listed.contains("not measured"),
+        listed.contains("100 of 100; nut_assembly (loose) from 10") && !listed.contains("not measured"),
         "{listed}"
     );
     assert!(!listed.contains('\u{1b}'), "colours in a pipe");

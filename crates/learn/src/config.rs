@@ -419,7 +419,7 @@ mod tests {
             RunConfig::resolve(preset, "nut_assembly", &set).unwrap().config
         };
         let (loose, square) = (resolve("laptop", &[]), resolve("laptop", &["task.variant=square"]));
-        assert!(!loose.closed_loop.explore.enabled && square.closed_loop.explore.enabled);
+        assert!(loose.critic.enabled && !square.critic.enabled);
         assert_eq!((square.closed_loop.cycles, square.train.update_from), (300, UpdateFrom::Scratch));
         // In whatever order they are given.
         let few = resolve("laptop", &["loop.cycles=7", "task.variant=square"]);
